@@ -1,0 +1,79 @@
+"""Light meets a surface: Fresnel reflectance, refraction, and the optical constants of the materials.
+
+Directions are those of propagation. `eta` is always n_transmitted / n_incident for the hit at hand.
+"""
+
+import math
+from dataclasses import dataclass
+
+from numba import njit
+
+from tsdf.errors import UsageError
+
+UNPOLARISED, S, P = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Optics:
+    """The optical constants of a grain in its surroundings.
+
+    Parameters
+    ----------
+    eta : float
+        n_inside / n_outside, finite and > 0; below 1 for a bubble.
+    fresnel : {"un", "sp"}
+        Reflectance averaged over the polarisations at each hit, or the two kept apart along the whole path.
+    material, source : str, optional
+        Where eta is from.
+    wavelength_nm, k : float, optional
+        The wavelength it holds for [nm] and the extinction coefficient there [1]; tracing does not use them.
+
+    Raises
+    ------
+    UsageError
+        If eta is not a finite number above 0 or the convention is unknown.
+    """
+
+    eta: float
+    fresnel: str = "un"
+    material: str | None = None
+    wavelength_nm: float | None = None
+    k: float | None = None
+    source: str | None = None
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.eta < math.inf):
+            raise UsageError(f"eta must be a finite number above 0 (n_inside / n_outside), got {self.eta}")
+        if self.fresnel not in ("un", "sp"):
+            raise UsageError(f"fresnel must be 'un' or 'sp', got {self.fresnel!r}")
+
+
+@njit(cache=True, inline="always")
+def fresnel(cos_i: float, eta: float, polarisation: int) -> tuple[float, float]:
+    """Return the power reflectance and the cosine of the refraction angle.
+
+    Parameters
+    ----------
+    cos_i : float
+        Cosine of the incidence angle on the incident side, in [0, 1].
+    eta : float
+        n_transmitted / n_incident, > 0.
+    polarisation : int
+        UNPOLARISED (the mean of both), S or P.
+
+    Returns
+    -------
+    reflectance, cos_t : float
+        (1, 0) where the reflection is total.
+    """
+    sin2_t = (1.0 - cos_i * cos_i) / (eta * eta)
+    if sin2_t >= 1.0:
+        return 1.0, 0.0
+    cos_t = math.sqrt(1.0 - sin2_t)
+    r_s = (cos_i - eta * cos_t) / (cos_i + eta * cos_t)
+    r_p = (eta * cos_i - cos_t) / (eta * cos_i + cos_t)
+    if polarisation == S:
+        return r_s * r_s, cos_t
+    if polarisation == P:
+        return r_p * r_p, cos_t
+    return 0.5 * (r_s * r_s + r_p * r_p), cos_t

@@ -1,0 +1,168 @@
+"""What a table is: the response of one grain, as the rows and columns of ``schema/SPEC.md``.
+
+A `Table` is the pixels of the file and its header, both read-only, and nothing else: what can be derived from them
+is derived here. How a table is made is `scatterometer`, its bytes are `format`. Lengths are in units of the bounding
+radius R, angles in radians, absorption is the dimensionless product sigma_a R.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from tsdf.errors import UsageError
+
+FORMAT_VERSION = "1.0"
+CONDITIONALS = ("p_phi", "p_r", "p_z", "p_l")
+RECORD_FIELDS = ("r", "z", "phi_delta", "l", "entry_b2", "entry_azimuth")
+
+
+def frozen(value: Any) -> Any:
+    """Return `value` with every mapping and sequence in it made read-only."""
+    if isinstance(value, Mapping):
+        return MappingProxyType({key: frozen(item) for key, item in value.items()})
+    if isinstance(value, list | tuple):
+        return tuple(frozen(item) for item in value)
+    return value
+
+
+def thawed(value: Any) -> Any:
+    """Return `value` as the plain dicts and lists that ``json`` writes; the inverse of `frozen`."""
+    if isinstance(value, Mapping):
+        return {key: thawed(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [thawed(item) for item in value]
+    return value
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """The scattering of one grain; immutable.
+
+    Parameters
+    ----------
+    header : mapping
+        The header of the file, see ``schema/header.schema.json``.
+    pixels : (rows, columns) float32
+        Columns are cells of cos theta in ascending order, rows are stacked blocks as ``header["blocks"]`` lists them.
+    """
+
+    header: Mapping[str, Any]
+    pixels: np.ndarray
+
+    def __post_init__(self) -> None:
+        pixels = np.array(self.pixels, dtype=np.float32, order="C")
+        pixels.flags.writeable = False
+        object.__setattr__(self, "pixels", pixels)
+        object.__setattr__(self, "header", frozen(self.header))
+
+    def __repr__(self) -> str:
+        grain, eta = self.header["grain"]["name"], self.header["optics"]["eta"]
+        return f"Table({grain}, eta={eta:g}, {self.pixels.shape[1]} cells of cos theta)"
+
+    def __contains__(self, name: str) -> bool:
+        return any(block["name"] == name for block in self.header["blocks"])
+
+    def _entry(self, name: str) -> Mapping[str, Any]:
+        for block in self.header["blocks"]:
+            if block["name"] == name:
+                return block
+        raise UsageError(f"the table has no block {name!r}; it has {', '.join(b['name'] for b in self.header['blocks'])}")
+
+    def block(self, name: str) -> np.ndarray:
+        """Return the rows of one block, (rows, columns) float32, read-only."""
+        entry = self._entry(name)
+        return self.pixels[entry["first_row"] : entry["first_row"] + entry["rows"]]
+
+    def edges(self, name: str) -> np.ndarray:
+        """Return the cell edges of the axis of a mass block, (rows + 1,) float64 in the block's unit."""
+        return np.array(self._entry(name)["edges"], dtype=np.float64)
+
+    @property
+    def cos_theta_edges(self) -> np.ndarray:
+        """Edges of the columns, (columns + 1,) float64 ascending from -1 to 1; a zero-width cell is an atom."""
+        return np.array(self.header["columns"]["edges"], dtype=np.float64)
+
+    @property
+    def p_theta(self) -> np.ndarray:
+        """Probability mass of each column, (columns,) float64; sums to 1."""
+        return self.block("p_theta")[0].astype(np.float64)
+
+    @property
+    def p_phi(self) -> np.ndarray:
+        """Mass of each cell of phi_Delta given the column, (rows, columns) float32; columns sum to 1."""
+        return self.block("p_phi")
+
+    @property
+    def p_r(self) -> np.ndarray:
+        """Mass of each cell of r given the column, (rows, columns) float32; columns sum to 1."""
+        return self.block("p_r")
+
+    @property
+    def p_z(self) -> np.ndarray:
+        """Mass of each cell of z given the column, (rows, columns) float32; columns sum to 1."""
+        return self.block("p_z")
+
+    @property
+    def p_l(self) -> np.ndarray:
+        """Mass of each cell of the path length given the column, (rows, columns) float32; columns sum to 1."""
+        return self.block("p_l")
+
+    @property
+    def joint(self) -> dict[str, np.ndarray]:
+        """The joint records by field, each (K, columns) float32; empty where the table holds none."""
+        return {f: self.block(f"joint_{f}") for f in RECORD_FIELDS if f"joint_{f}" in self}
+
+    @property
+    def statistics(self) -> Mapping[str, Any]:
+        """The statistics of the lossless grain as the header states them."""
+        return self.header["statistics"]
+
+    def survival(self, absorption: float) -> np.ndarray:
+        """Return the share of each column's light that an absorbing grain lets out, (columns,) float64 in [0, 1].
+
+        Parameters
+        ----------
+        absorption : float
+            sigma_a R, the absorption coefficient times the bounding radius, >= 0.
+        """
+        if not (absorption >= 0.0):
+            raise UsageError(f"absorption must be a number >= 0 (sigma_a times the bounding radius), got {absorption}")
+        if absorption == 0.0:
+            return np.ones(self.pixels.shape[1])
+        with np.errstate(under="ignore"):
+            decay = np.exp(-min(absorption, 1e30) * self.block("mean_l").astype(np.float64))
+        return np.einsum("ij,ij->j", self.p_l.astype(np.float64), decay)
+
+    def deflection_masses(self, absorption: float = 0.0) -> np.ndarray:
+        """Return the deflection distribution of what an absorbing grain lets out, (columns,) float64, sum 1.
+
+        Zero everywhere where nothing is let out.
+        """
+        masses = self.p_theta * self.survival(absorption)
+        total = masses.sum()
+        return masses / total if total > 0.0 else masses
+
+    def albedo(self, absorption: float = 0.0) -> float:
+        """Return the energy that leaves over the energy that met the grain (physics: E[exp(-sigma_a R l)])."""
+        p = self.p_theta
+        return float(self.statistics["albedo"] * (p @ self.survival(absorption)) / p.sum())
+
+    def mean_cosine(self, absorption: float = 0.0) -> float:
+        """Return the energy-weighted mean of cos theta of what an absorbing grain lets out.
+
+        The lossless value is the header's own, which the cell width does not touch; absorption shifts it by the
+        change of the masses between cells. Not a number where nothing is let out.
+        """
+        lossless = float(self.statistics["mean_cosine"])
+        if absorption == 0.0:
+            return lossless
+        masses = self.deflection_masses(absorption)
+        if not masses.any():
+            return math.nan
+        edges = self.cos_theta_edges
+        middle = 0.5 * (edges[1:] + edges[:-1])
+        return float(lossless + middle @ (masses - self.deflection_masses()))

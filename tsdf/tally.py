@@ -1,0 +1,127 @@
+"""What the scatterometer counts: integer sums that add up in any order to the same total.
+
+A `Tally` is a set of int64 arrays plus, if asked for, reservoirs of joint records. Weights are fixed-point: a path
+starts with `UNIT` units of energy and every split of them is exact, so that the energy ledger balances to the last
+unit and the sum over threads, chunks and machines does not depend on their order.
+
+Cells of theta are uniform in theta, ascending from 0, with the forward and the backward atom last; `estimate` turns
+them into the columns of a table. Lengths are in units of the bounding radius R, angles in radians.
+"""
+
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+UNIT = 1 << 24  # energy units of one path
+REPLICATES = 64  # independently scrambled samples; errors come from their spread
+FINE = 4096  # cells of theta in which p_theta is counted
+COARSE = 1024  # cells of theta in which the conditionals are counted; divides FINE
+GROUPS = 64  # cells of theta in which joint distributions are counted; divides FINE
+PHI, R, Z = 32, 64, 96  # cells of phi_Delta, r, z
+BOX = {"phi": 8, "r": 16, "z": 16, "l": 16}  # cells of the joint distributions
+BOX_LENGTH = 6.0  # path lengths from here on share the last cell of "l" [R]
+# Path length: nothing, 1/16 up to 4, quarter octaves up to 16, then octaves
+L_EDGES = np.concatenate(
+    ([0.0, 0.0], np.arange(1, 65) / 16.0, 4.0 * 2.0 ** (np.arange(1, 9) / 4.0), 16.0 * 2.0 ** np.arange(1, 17))
+)
+L = len(L_EDGES) - 1
+PHI_EDGES = (2.0 * np.arange(PHI + 1) - 1.0) * np.pi / PHI
+R_EDGES = np.linspace(0.0, 2.0, R + 1)
+Z_EDGES = np.linspace(-1.0, 2.0, Z + 1)
+
+# First columns of the conditionals in `Tally.cells`
+AT_PHI, AT_R, AT_Z, AT_L, AT_L_SUM = 0, PHI, PHI + R, PHI + R + Z, PHI + R + Z + L
+
+# Scalar sums, one row per replicate
+SCALARS = (
+    "launched",
+    "unscattered",
+    "scattered",
+    "truncated",
+    "lost",
+    "cos_theta",
+    "r",
+    "z",
+    "path_length",
+    "offset",
+    "miss_chord",
+)
+LAUNCHED, UNSCATTERED, SCATTERED, TRUNCATED, LOST, COS_THETA, MEAN_R, MEAN_Z, PATH_LENGTH, OFFSET, MISS_CHORD = range(11)
+
+# A record of the reservoirs: key, weight, then table.RECORD_FIELDS
+RECORD = 8
+
+
+def _zeros(*shape: int) -> np.ndarray:
+    return field(default_factory=lambda: np.zeros(shape, dtype=np.int64))
+
+
+@dataclass(eq=False)
+class Tally:
+    """Sums over paths, [units of energy] unless said otherwise.
+
+    Parameters
+    ----------
+    joint : int
+        Records kept per theta cell; 0 keeps none.
+    scalars : (REPLICATES, len(SCALARS)) int64
+        Energies, and energy times cos theta, r, z, l, |x_o - x_i|; miss_chord is energy times the chord of a miss.
+    theta : (REPLICATES, FINE + 2) int64
+        Energy by deflection.
+    cells : (COARSE + 2, PHI + R + Z + 2 L) int64
+        The conditionals side by side, `phi`, `r`, `z`, `l` and `l_sum`: energy by phi_Delta, r, z and path length,
+        and energy times path length. Every path counts twice in the first three, as it is and reversed.
+    box : (2, GROUPS + 2, 8, 16, 16) int64
+        Energy by (phi, r, z), for the even and the odd replicates.
+    box_l : (2, GROUPS + 2, 16, 8 + 16 + 16) int64
+        Energy by path length and each of phi, r, z.
+    records : (COARSE + 2, joint, RECORD) float64
+        Bottom-k samples: the records with the smallest keys -ln(u) / weight, in no order.
+    """
+
+    joint: int = 0
+    scalars: np.ndarray = _zeros(REPLICATES, len(SCALARS))
+    theta: np.ndarray = _zeros(REPLICATES, FINE + 2)
+    cells: np.ndarray = _zeros(COARSE + 2, PHI + R + Z + 2 * L)
+    box: np.ndarray = _zeros(2, GROUPS + 2, BOX["phi"], BOX["r"], BOX["z"])
+    box_l: np.ndarray = _zeros(2, GROUPS + 2, BOX["l"], BOX["phi"] + BOX["r"] + BOX["z"])
+    records: np.ndarray = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        if self.records.size == 0:
+            self.records = np.full((COARSE + 2, self.joint, RECORD), np.inf)
+
+    def conditional(self, name: str) -> np.ndarray:
+        """Return "phi", "r", "z", "l" or "l_sum", (COARSE + 2, cells) int64, a view."""
+        first, count = {
+            "phi": (AT_PHI, PHI),
+            "r": (AT_R, R),
+            "z": (AT_Z, Z),
+            "l": (AT_L, L),
+            "l_sum": (AT_L_SUM, L),
+        }[name]
+        return self.cells[:, first : first + count]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the arrays by name; views, not copies."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "joint"}
+
+    def add(self, other: "Tally") -> None:
+        """Add the counts of `other`, which holds other paths and as many records per cell."""
+        for name, mine in self.arrays().items():
+            if name != "records":
+                mine += getattr(other, name)
+        if self.joint:
+            both = np.concatenate((self.records, other.records), axis=1)
+            self.records = smallest(both, self.joint)
+
+    def clear(self) -> None:
+        """Forget everything."""
+        for name, mine in self.arrays().items():
+            mine[...] = np.inf if name == "records" else 0
+
+
+def smallest(records: np.ndarray, count: int) -> np.ndarray:
+    """Return the `count` records of the smallest keys, (cells, count, RECORD), sorted by key within each cell."""
+    order = np.argsort(records[:, :, 0], axis=1, kind="stable")[:, :count]
+    return np.take_along_axis(records, order[:, :, None], axis=1)
