@@ -592,8 +592,8 @@ class SphereEvents:
 @_jit
 def _events(
     edges: Array, eta: float, apart: bool, absorption: float, first: int, floor: float
-) -> tuple[Array, float]:
-    """Rows of SphereEvents for rays that can enter, order >= first and weight >= floor; energy left out.
+) -> tuple[Array, int, float]:
+    """Rows of SphereEvents, order >= first and weight >= floor, of rays that can enter; count; energy left.
 
     The parts of an interval split by a rainbow or a fold keep the energies of its middle: the sum is exact.
     """
@@ -632,7 +632,9 @@ def _events(
                         if end > a:
                             if count == out.shape[1]:
                                 bigger = np.empty((10, 2 * count))
-                                bigger[:, :count] = out
+                                for row in range(10):
+                                    for i in range(count):
+                                        bigger[row, i] = out[row, i]
                                 out = bigger
                             middle = (a + end) / 2
                             ti, tt, ci, ct = _ray(middle, eta)
@@ -663,7 +665,7 @@ def _events(
                 w1 *= r1 * decay
                 w2 *= r2 * decay
         residual += (w1 / t1 + w2 / t2) * energy
-    return out[:, :count].copy(), residual
+    return out, count, residual
 
 
 def _list_events(
@@ -678,7 +680,8 @@ def _list_events(
     _, _, t1, t2 = _fresnel(ci, ct, eta, apart)
     # below the floor, the tail of an interval holds at most floor/T
     floor = 5e-10 / (1 / np.minimum(t1, t2)).sum()
-    return _events(edges, eta, apart, absorption, first, floor)
+    rows, count, residual = _events(edges, eta, apart, absorption, first, floor)
+    return rows[:, :count], residual
 
 
 def sphere_events(eta: float, fresnel: str = "un", intervals: int = 65536) -> SphereEvents:
@@ -804,7 +807,7 @@ def convex_theorems(area: float, volume: float, bounding_radius: float = 1.0) ->
     beta = area / (4 * np.pi * bounding_radius**2)
     if beta > 1 + 1e-9 or 36 * np.pi * volume**2 > area**3 * (1 + 1e-9):
         raise UsageError(
-            f"area {area:g} and volume {volume:g} fit no convex grain in a sphere of radius {bounding_radius:g}"
+            f"no convex grain has area {area:g} and volume {volume:g} within radius {bounding_radius:g}"
         )
     return ConvexTheorems(float(min(beta, 1.0)), 4 * volume / area, 4 * bounding_radius / 3)
 

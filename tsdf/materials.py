@@ -1,11 +1,11 @@
-"""What grains are made of: refractive index n and absorption index k of six materials, by wavelength in vacuum or air.
+"""What grains are made of: refractive index n and absorption index k of six materials, by wavelength.
 
-The complex index is n - i k, so the absorption coefficient of the bulk is 4 pi k / wavelength. No light meets a
-surface here: that is `optics`. Sellmeier coefficients and tables are those of the refractiveindex.info database (CC0),
-which took them from the sources named in `MEDIA`; k is None where that source gives none, which is not k = 0.
-Between nodes n is linear in 1/wavelength^2 (normal dispersion is nearly so: the 50 nm steps of ice below 400 nm then
-hold n to 1e-4, linear in wavelength they would not) and log k is linear in wavelength. Crystals are taken as
-isotropic: birefringence is ignored, see the source string of each.
+The complex index is n - i k, so the absorption coefficient of the bulk is 4 pi k / wavelength. How light
+meets a surface is `optics`. The numbers are those of the refractiveindex.info database (CC0), which has them
+from the sources named in `MEDIA`; sucrose is not in it. k is None where the source gives none, which is not
+k = 0. Between the nodes of a table log k is linear in wavelength, and n in 1/wavelength^2, as normal
+dispersion nearly is: that holds n of ice to 1e-4 from 350 to 390 nm, where linear in wavelength would miss
+by 2e-4. Crystals are taken as isotropic: birefringence is ignored.
 """
 
 import math
@@ -16,13 +16,28 @@ import numpy as np
 
 from tsdf.errors import UsageError
 
-UM_PER_NM = 1e-3  # [um/nm], the Sellmeier formulas are written in micrometres
+UM_PER_NM = 1e-3  # [um/nm]
 
-# Tables. Wavelengths in nm, n and k dimensionless.
 # fmt: off
-ICE_NODES_NM = (300, 350, 390, *range(400, 1401, 10))
+# Terms (strength [1], resonance^2 [um^2]) of n^2 = sum of strength * w^2 / (w^2 - resonance^2)
+WATER_TERMS = (  # Daimon & Masumura 2007, 20.0 C
+    (1.0, 0.0), (5.684027565e-1, 5.101829712e-3), (1.726177391e-1, 1.821153936e-2),
+    (2.086189578e-2, 2.620722293e-2), (1.130748688e-1, 1.069792721e1),
+)
+QUARTZ_TERMS = (  # Ghosh 1999, ordinary ray
+    (1.28604141, 0.0), (1.07044083, 1.00585997e-2), (1.10202242, 100.0),
+)
+SALT_TERMS = (  # NaCl, Li 1976, 297 K
+    (1.00055, 0.0), (0.19800, 0.050**2), (0.48398, 0.100**2), (0.38696, 0.128**2), (0.25998, 0.158**2),
+    (0.08796, 40.50**2), (3.17064, 60.98**2), (0.30038, 120.34**2),
+)
+GLASS_TERMS = (  # Schott N-BK7, catalogue 2017-01-20, 293 K
+    (1.0, 0.0), (1.03961212, 0.00600069867), (0.231792344, 0.0200179144), (1.01046945, 103.560653),
+)
+SUCROSE_PRINCIPAL_N = (1.5376, 1.5651, 1.5705)  # [1] n_alpha, n_beta, n_gamma, 589 nm, source not traced
+ICE_NODES_NM = (350, 390, *range(400, 1401, 10))  # [nm] Warren & Brandt 2008, 266 K
 ICE_N = (  # [1], one row per 100 nm from 400 nm on
-    1.3339, 1.3249, 1.3203,
+    1.3249, 1.3203,
     1.3194, 1.3185, 1.3177, 1.3170, 1.3163, 1.3157, 1.3151, 1.3145, 1.3140, 1.3135,
     1.3130, 1.3126, 1.3121, 1.3117, 1.3114, 1.3110, 1.3106, 1.3103, 1.3100, 1.3097,
     1.3094, 1.3091, 1.3088, 1.3085, 1.3083, 1.3080, 1.3078, 1.3076, 1.3073, 1.3071,
@@ -35,8 +50,8 @@ ICE_N = (  # [1], one row per 100 nm from 400 nm on
     1.2961, 1.2959, 1.2957, 1.2955, 1.2953, 1.2951, 1.2949, 1.2946, 1.2944, 1.2941,
     1.2939,
 )
-ICE_K = (  # [1], same nodes, 2e-11 is the floor the source sets up to 390 nm
-    2e-11, 2e-11, 2e-11,
+ICE_K = (  # [1], same nodes; the source holds 2e-11 from 202 to 390 nm
+    2e-11, 2e-11,
     2.365e-11, 2.669e-11, 3.135e-11, 4.14e-11, 6.268e-11,
     9.239e-11, 1.325e-10, 1.956e-10, 2.861e-10, 4.172e-10,
     5.889e-10, 8.036e-10, 1.076e-9, 1.409e-9, 1.813e-9, 2.289e-9, 2.839e-9, 3.461e-9, 4.159e-9, 4.93e-9,
@@ -50,13 +65,13 @@ ICE_K = (  # [1], same nodes, 2e-11 is the floor the source sets up to 390 nm
     1.32e-5, 1.31e-5, 1.32e-5, 1.32e-5, 1.34e-5, 1.39e-5, 1.42e-5, 1.48e-5, 1.58e-5, 1.74e-5,
     1.98e-5,
 )
-WATER_NODES_NM = tuple(range(300, 1001, 25))
+WATER_NODES_NM = tuple(range(300, 1001, 25))  # [nm] Hale & Querry 1973, 25 C
 WATER_K = (  # [1], same nodes
     1.6e-8, 1.08e-8, 6.5e-9, 3.5e-9, 1.86e-9, 1.3e-9, 1.02e-9, 9.35e-10, 1e-9, 1.32e-9,
     1.96e-9, 3.6e-9, 1.09e-8, 1.39e-8, 1.64e-8, 2.23e-8, 3.35e-8, 9.15e-8, 1.56e-7, 1.48e-7,
     1.25e-7, 1.82e-7, 2.93e-7, 3.91e-7, 4.86e-7, 1.06e-6, 2.93e-6, 3.48e-6, 2.89e-6,
 )
-GLASS_NODES_NM = (  # [nm]
+GLASS_NODES_NM = (  # [nm] Schott N-BK7, as above
     300, 310, 320, 334, 350, 365, 370, 380, 390, 400, 405, 420, 436,
     460, 500, 546, 580, 620, 660, 700, 1060, 1530, 1970, 2325, 2500,
 )
@@ -67,34 +82,6 @@ GLASS_K = (  # [1], same nodes
 )
 # fmt: on
 
-# Sellmeier: n^2 = constant + sum of strength * w^2 / (w^2 - resonance^2), pairs (strength, resonance^2 [um^2]).
-WATER_CONSTANT = 1.0
-WATER_TERMS = (  # Daimon & Masumura 2007, 20.0 C
-    (5.684027565e-1, 5.101829712e-3),
-    (1.726177391e-1, 1.821153936e-2),
-    (2.086189578e-2, 2.620722293e-2),
-    (1.130748688e-1, 1.069792721e1),
-)
-QUARTZ_CONSTANT = 1.28604141
-QUARTZ_TERMS = ((1.07044083, 1.00585997e-2), (1.10202242, 100.0))  # Ghosh 1999, ordinary ray
-SALT_CONSTANT = 1.00055
-SALT_TERMS = (  # Li 1976, 297 K; the source gives the resonances, here squared
-    (0.19800, 0.050**2),
-    (0.48398, 0.100**2),
-    (0.38696, 0.128**2),
-    (0.25998, 0.158**2),
-    (0.08796, 40.50**2),
-    (3.17064, 60.98**2),
-    (0.30038, 120.34**2),
-)
-GLASS_CONSTANT = 1.0
-GLASS_TERMS = (  # Schott N-BK7, catalogue of 2017, 293 K
-    (1.03961212, 0.00600069867),
-    (0.231792344, 0.0200179144),
-    (1.01046945, 103.560653),
-)
-SUCROSE_PRINCIPAL_N = (1.5376, 1.5651, 1.5705)  # n_alpha, n_beta, n_gamma at 589 nm, handbook values
-
 
 @dataclass(frozen=True)
 class OpticalConstants:
@@ -104,33 +91,32 @@ class OpticalConstants:
     k: float | None  # absorption index [1]; None where the source gives none
     wavelength_nm: float  # the wavelength asked for [nm]
     material: str  # one of MATERIALS
-    source: str  # short citation, with what was measured and what is ignored
+    source: str  # short citation, with what is ignored
 
 
 @dataclass(frozen=True)
 class Medium:
     """How the optical constants of one material are found, and where that holds."""
 
-    shortest_nm: float  # both ends are included [nm]
-    longest_nm: float
+    range_nm: tuple[float, float]  # both ends are included [nm]
     n: Callable[[float], float]  # of the wavelength [nm]
     k: Callable[[float], float] | None
     source: str
 
 
-def sellmeier(constant: float, terms: Sequence[tuple[float, float]]) -> Callable[[float], float]:
-    """Return n as a function of the wavelength [nm] from pairs (strength, squared resonance [um^2])."""
+def sellmeier_n(terms: Sequence[tuple[float, float]]) -> Callable[[float], float]:
+    """Return n as a function of the wavelength [nm] from (strength [1], resonance^2 [um^2])."""
 
     def n(wavelength_nm: float) -> float:
         w2 = (wavelength_nm * UM_PER_NM) ** 2
-        return math.sqrt(constant + sum(strength * w2 / (w2 - resonance2) for strength, resonance2 in terms))
+        return math.sqrt(sum(strength * w2 / (w2 - resonance2) for strength, resonance2 in terms))
 
     return n
 
 
 def table_n(nodes_nm: Sequence[float], values: Sequence[float]) -> Callable[[float], float]:
     """Return n as a function of the wavelength [nm], linear in 1/wavelength^2 between ascending nodes."""
-    abscissae = -1.0 / np.array(nodes_nm, dtype=float) ** 2
+    abscissae = -1.0 / np.array(nodes_nm, dtype=np.float64) ** 2
     return lambda wavelength_nm: float(np.interp(-1.0 / wavelength_nm**2, abscissae, values))
 
 
@@ -142,47 +128,39 @@ def table_k(nodes_nm: Sequence[float], values: Sequence[float]) -> Callable[[flo
 
 MEDIA = {
     "ice": Medium(
-        300.0,
-        1400.0,
+        (350.0, 1400.0),
         table_n(ICE_NODES_NM, ICE_N),
         table_k(ICE_NODES_NM, ICE_K),
         "Warren & Brandt 2008, doi:10.1029/2007JD009744, 266 K; birefringence ignored",
     ),
     "water": Medium(
-        300.0,
-        1000.0,
-        sellmeier(WATER_CONSTANT, WATER_TERMS),
+        (300.0, 1000.0),
+        sellmeier_n(WATER_TERMS),
         table_k(WATER_NODES_NM, WATER_K),
-        "n: Daimon & Masumura 2007, doi:10.1364/AO.46.003811, 20 C; "
-        "k: Hale & Querry 1973, doi:10.1364/AO.12.000555, 25 C",
+        "n Daimon & Masumura 2007, doi:10.1364/AO.46.003811, 20 C; "
+        "k Hale & Querry 1973, doi:10.1364/AO.12.000555, 25 C",
     ),
     "quartz": Medium(
-        198.0,
-        2053.1,
-        sellmeier(QUARTZ_CONSTANT, QUARTZ_TERMS),
+        (198.0, 2053.1),
+        sellmeier_n(QUARTZ_TERMS),
         None,
         "Ghosh 1999, doi:10.1016/S0030-4018(99)00091-7, ordinary ray; birefringence ignored",
     ),
     "salt": Medium(
-        200.0,
-        30000.0,
-        sellmeier(SALT_CONSTANT, SALT_TERMS),
-        None,
-        "NaCl: Li 1976, doi:10.1063/1.555536, 297 K",
+        (200.0, 30000.0), sellmeier_n(SALT_TERMS), None, "NaCl, Li 1976, doi:10.1063/1.555536, 297 K"
     ),
     "glass": Medium(
-        300.0,
-        2500.0,
-        sellmeier(GLASS_CONSTANT, GLASS_TERMS),
+        (300.0, 2500.0),
+        sellmeier_n(GLASS_TERMS),
         table_k(GLASS_NODES_NM, GLASS_K),
-        "N-BK7: Schott catalogue 2017-01-20, 293 K; k from its internal transmittance",
+        "Schott N-BK7, catalogue 2017-01-20, 293 K",
     ),
     "sucrose": Medium(
-        400.0,
-        700.0,
+        (400.0, 700.0),
         lambda _: math.fsum(SUCROSE_PRINCIPAL_N) / len(SUCROSE_PRINCIPAL_N),
         None,
-        "handbook value, 589 nm, used at every wavelength; mean of three principal indices, birefringence ignored",
+        "handbook value of 589 nm (primary source not traced) used at every wavelength; "
+        "mean of the three principal indices, birefringence ignored",
     ),
 }
 MATERIALS: tuple[str, ...] = tuple(MEDIA)
@@ -194,29 +172,19 @@ def optical_constants(material: str, wavelength_nm: float) -> OpticalConstants:
     Parameters
     ----------
     material : str
-        One of MATERIALS: ice 300-1400 nm, water 300-1000, quartz 198-2053.1, salt (NaCl) 200-30000,
-        glass (Schott N-BK7) 300-2500, sucrose 400-700. The ends are included.
+        One of MATERIALS, ends included: ice 350-1400 nm, water 300-1000, quartz (ordinary ray) 198-2053.1,
+        salt (NaCl) 200-30000, glass (Schott N-BK7) 300-2500, sucrose 400-700. k is None for quartz, salt and
+        sucrose. n of sucrose is that of 589 nm throughout; n of quartz falls by 0.017 over the same range.
     wavelength_nm : float
-        Wavelength [nm], in the range of the material.
-
-    Returns
-    -------
-    OpticalConstants
-        k is None for quartz, salt and sucrose. n of sucrose is that of 589 nm throughout; over the same range
-        the n of quartz falls by 0.017.
-
-    Raises
-    ------
-    UsageError
-        Where the material is unknown, or the wavelength is not a finite number > 0 or out of range.
+        Wavelength [nm]. Outside the range of the material, or not a number: UsageError.
     """
-    if material not in MEDIA:
+    if material not in MATERIALS:
         raise UsageError(f"unknown material {material!r}; it is one of {', '.join(MATERIALS)}")
     medium, wavelength_nm = MEDIA[material], float(wavelength_nm)
-    if not medium.shortest_nm <= wavelength_nm <= medium.longest_nm:
+    shortest, longest = medium.range_nm
+    if not shortest <= wavelength_nm <= longest:
         raise UsageError(
-            f"the wavelength of {material} must be in {medium.shortest_nm:g} to {medium.longest_nm:g} nm, "
-            f"not {wavelength_nm:g}"
+            f"the wavelength must be {shortest:g} to {longest:g} nm for {material}, not {wavelength_nm:.10g}"
         )
     k = None if medium.k is None else medium.k(wavelength_nm)
     return OpticalConstants(medium.n(wavelength_nm), k, wavelength_nm, material, medium.source)

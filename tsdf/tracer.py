@@ -11,6 +11,7 @@ function of the seed and the path's number, so paths may be traced in any order,
 
 import math
 from dataclasses import dataclass
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -623,8 +624,11 @@ class Tracer:
         self._states, self._metas, self._origins, self._rays = grown, notes, origins, rays
         self._capacity = capacity
 
-    def trace(self, paths: np.ndarray, tally: Tally) -> int:
-        """Trace the paths of the numbers given, (n,) int64, into `tally`; return the number of rays that took."""
+    def trace(self, paths: np.ndarray, tally: Tally, stop: Event | None = None) -> int:
+        """Trace the paths of the numbers given, (n,) int64, into `tally`; return the number of rays that took.
+
+        Once `stop` is set the counts are worthless.
+        """
         counters = (tally.scalars, tally.theta, tally.cells, tally.box, tally.box_l, tally.records)
         fan = 1 if self.plain else self.fan
         split = np.int64(T.UNIT if self.plain else self.split * T.UNIT / fan)
@@ -632,7 +636,7 @@ class Tracer:
         first, live, total, mine = 0, 0, 0, 0
         forever = np.zeros(self._capacity, dtype=np.int32)
         tally.scalars[:, T.LAUNCHED] += T.UNIT * np.bincount(paths % T.REPLICATES, minlength=T.REPLICATES)
-        while live or first < len(paths):
+        while (live or first < len(paths)) and not (stop is not None and stop.is_set()):
             if live < self.slots // 2 and first < len(paths):
                 fresh = paths[first : first + self.slots - live]
                 spawn(fresh, live, self.seed, self.plain, SOBOL,

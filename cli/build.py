@@ -1,0 +1,281 @@
+"""``tsdf-build``: a grain in, a table out."""
+
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from tsdf.cli.common import reports_errors
+from tsdf.errors import TSDFError, UsageError
+
+if TYPE_CHECKING:
+    from tsdf.scatterometer import Build, Progress
+
+DEFAULT_MATERIAL, DEFAULT_WAVELENGTH_NM = "ice", 550.0
+
+
+def _list_grains(context: click.Context, _: click.Parameter, value: bool) -> None:
+    if not value or context.resilient_parsing:
+        return
+    from tsdf.exemplars import EXEMPLARS
+
+    click.echo("sphere: the exact sphere, by quadrature (or --traced)")
+    for name, exemplar in EXEMPLARS.items():
+        click.echo(f"{name}: {exemplar.summary}")
+        for key, p in exemplar.parameters.items():
+            unit = f" {p.unit}" if p.unit else ""
+            click.echo(f"    --set {key}={p.default:g}  {p.low:g} to {p.high:g}{unit}: {p.meaning}")
+    context.exit()
+
+
+def _count(context: click.Context, parameter: click.Parameter, value: str | None) -> int | None:
+    """Read a whole number, also written as 1e7."""
+    if value is None:
+        return None
+    try:
+        number = float(value)
+        if number == int(number):
+            return int(value) if value.lstrip("+-").isdigit() else int(number)
+    except (ValueError, OverflowError):
+        pass
+    raise click.BadParameter(f"{value!r} is not a whole number", context, parameter)
+
+
+def _part(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:
+    if value is None:
+        return None
+    first, slash, second = value.partition("/")
+    if slash and first.isdigit() and second.isdigit() and 1 <= int(first) <= int(second):
+        return int(first), int(second)
+    raise click.BadParameter(f"{value!r} is not i/n with 1 <= i <= n", context, parameter)
+
+
+def _setting(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
+    settings = {}
+    for value in values:
+        name, equals, number = value.partition("=")
+        if not equals or not name or name in settings:
+            raise click.BadParameter(f"{value!r} is not NAME=VALUE, each name once", context, parameter)
+        settings[name] = number
+    return settings
+
+
+def check_output(out: Path) -> None:
+    """Refuse an output that cannot be written before any work is done for it.
+
+    Raises
+    ------
+    TSDFError
+    """
+    if not out.parent.is_dir():
+        raise TSDFError(f"cannot write {out}: {out.parent} is not a folder; make it, or choose another --out")
+    if out.exists() and not out.is_file():
+        raise TSDFError(f"cannot write {out}: it is not a regular file; choose another --out")
+    if not os.access(out.parent, os.W_OK):
+        raise TSDFError(f"cannot write {out}: no permission in {out.parent}; choose another --out")
+
+
+class Bar:
+    """A progress bar on standard error: paths, rate, current error, time left."""
+
+    def __init__(self, target: float | None, quiet: bool) -> None:
+        from tqdm import tqdm
+
+        self._target = target
+        self._bar = tqdm(unit=" paths", unit_scale=True, disable=quiet, file=sys.stderr, dynamic_ncols=True)
+
+    def __call__(self, progress: "Progress") -> None:
+        bar = self._bar
+        if bar.n == 0:
+            bar.initial = progress.paths
+        bar.total = progress.total
+        if self._target is not None and progress.error is not None and progress.paths:
+            # noise falls as the square root of the paths: a guess of how many the target takes
+            bar.total = int(progress.paths * max(1.0, progress.error / self._target) ** 2)
+        if progress.error is not None:
+            bar.set_postfix_str(f"total variation {progress.error:.2g}, {progress.cells} cells", refresh=False)
+        bar.n = progress.paths
+        bar.refresh()
+
+    def close(self) -> None:
+        """Leave the bar as it is."""
+        self._bar.close()
+
+
+@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.argument("grain")
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="The table to write, NAME.tsdf.exr.")
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    callback=_setting,
+    metavar="NAME=VALUE",
+    help="A parameter of a built-in grain; --grains lists them. May be given several times.",
+)
+@click.option("--eta", type=float, help="Relative refractive index n_inside / n_outside.  [default: ice at 550 nm]")
+@click.option("--material", help="ice, water, quartz, salt, glass or sucrose, in air.")
+@click.option("--wavelength-nm", type=float, help=f"Wavelength for --material [nm].  [default: {DEFAULT_WAVELENGTH_NM:g}]")
+@click.option(
+    "--fresnel",
+    type=click.Choice(["un", "sp"]),
+    default="un",
+    show_default=True,
+    help="Fresnel reflectance averaged at each hit, or polarisations kept apart (sphere only).",
+)
+@click.option("--traced", is_flag=True, help="Send the exact sphere through the Monte Carlo tracer, too.")
+@click.option("--paths", callback=_count, metavar="N", help="Paths to trace.  [default: 4e6]")
+@click.option("--target-error", type=float, metavar="E", help="Stop at this estimated total variation of p_theta.")
+@click.option("--cells", callback=_count, metavar="N", help="Cells of theta.  [default: 256, or what the target needs]")
+@click.option(
+    "--joint", callback=_count, default="0", metavar="K", show_default=True, help="Joint records per cell of theta."
+)
+@click.option("--seed", callback=_count, default="0", metavar="N", show_default=True, help="Seed of the random numbers.")
+@click.option(
+    "--max-bounces", callback=_count, default="100000", metavar="N", show_default=True, help="Hits before a path is cut."
+)
+@click.option("--threads", callback=_count, metavar="N", help="Threads; the result does not depend on it.  [default: all]")
+@click.option("--repair", is_flag=True, help="Try to close an open mesh, and say what that changed.")
+@click.option("--chunk", "part", callback=_part, metavar="i/n", help="Trace part i of n only; --out is for tsdf-merge.")
+@click.option("--resume", is_flag=True, help="Go on with an interrupted build of the same command.")
+@click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
+@click.option(
+    "--grains",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_list_grains,
+    help="List the built-in grains and their parameters.",
+)
+@reports_errors
+def main(
+    grain: str,
+    out: Path,
+    settings: dict[str, str],
+    eta: float | None,
+    material: str | None,
+    wavelength_nm: float | None,
+    fresnel: str,
+    traced: bool,
+    paths: int | None,
+    target_error: float | None,
+    cells: int | None,
+    joint: int,
+    seed: int,
+    max_bounces: int,
+    threads: int | None,
+    repair: bool,
+    part: tuple[int, int] | None,
+    resume: bool,
+    quiet: bool,
+) -> None:
+    """Build the table of GRAIN: "sphere", a built-in grain (see --grains), or a mesh file."""
+    if eta is not None and material is not None:
+        raise UsageError("give --eta or --material, not both")
+    if eta is not None and wavelength_nm is not None:
+        raise UsageError("--wavelength-nm goes with --material, not with --eta")
+    if threads is not None and not (1 <= threads <= 1024):
+        raise UsageError(f"the threads must be 1 to 1024, got {threads}")
+    if traced and grain != "sphere":
+        raise UsageError("--traced is for the exact sphere; every other grain is traced anyway")
+    exact = grain == "sphere" and not traced
+    if exact and (part is not None or resume or paths is not None):
+        raise UsageError("the exact sphere takes no paths, chunks or resuming; add --traced to trace it")
+    if part is not None and target_error is not None:
+        raise UsageError("parts cannot know when the whole meets a target: give --paths with --chunk")
+    if repair and grain == "sphere":
+        raise UsageError("--repair is for mesh files")
+
+    from tsdf import scatterometer
+    from tsdf.optics import Optics
+
+    if eta is None:
+        from tsdf.materials import optical_constants
+
+        found = optical_constants(material or DEFAULT_MATERIAL, wavelength_nm or DEFAULT_WAVELENGTH_NM)
+        optics = Optics(found.n, fresnel, found.material, found.wavelength_nm, found.k, found.source)
+    else:
+        optics = Optics(eta, fresnel)
+    effort = scatterometer.Effort(paths, target_error, cells, joint, seed, max_bounces)
+    check_output(out)
+    part_file = out if part is not None else out.with_name(out.name + ".part")
+    if not exact and part_file.exists() and not resume:
+        raise TSDFError(f"{part_file} holds an unfinished build: add --resume to go on with it, or delete it")
+
+    from tsdf.grains import load_grain
+
+    shape = load_grain(grain, repair=repair, **settings)
+    if not quiet:
+        for note in shape.notes:
+            click.echo(f"note: {note}", err=True)
+    if exact:
+        finish(scatterometer.exact_sphere(shape, optics, effort), out, quiet)
+        return
+
+    build = scatterometer.Build.start(shape, optics, effort)
+    if resume and part_file.exists():
+        stored = scatterometer.Build.load(part_file)
+        if stored.request != build.request:
+            differing = ", ".join(key for key in build.request if build.request[key] != stored.request.get(key))
+            raise TSDFError(f"{part_file} is of another build (they differ in {differing}): delete it to start anew")
+        build = stored
+    _run(build, shape, threads or os.cpu_count() or 1, part, part_file, quiet)
+    if part is not None:
+        if not quiet:
+            click.echo(f"{out}: part {part[0]} of {part[1]}, {build.paths} paths; tsdf-merge makes the table")
+        return
+    finish(build.table(), out, quiet)
+    part_file.unlink(missing_ok=True)
+
+
+def _run(build: "Build", shape: Any, threads: int, part: tuple[int, int] | None, part_file: Path, quiet: bool) -> None:
+    """Trace with a progress bar; an interrupt says what is safe."""
+
+    def stop(number: int, _: object) -> None:
+        raise KeyboardInterrupt(number)
+
+    before = signal.signal(signal.SIGTERM, stop)
+    bar = Bar(build.effort.target_error, quiet)
+    try:
+        build.run(shape, threads, part or (1, 1), part_file, bar)
+    except KeyboardInterrupt as interrupt:
+        bar.close()
+        safe = f"{build.paths} paths are safe in {part_file}; go on with --resume" if part_file.exists() else "nothing done yet"
+        click.echo(f"interrupted: {safe}", err=True)
+        raise SystemExit(128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)) from None
+    finally:
+        bar.close()
+        signal.signal(signal.SIGTERM, before)
+
+
+def finish(table: Any, out: Path, quiet: bool) -> None:
+    """Write a finished table and sum it up on standard output."""
+    from tsdf.format import write
+
+    write(table, out)
+    if quiet:
+        return
+    s, errors, ledger = table.statistics, table.header["standard_errors"], table.header["energy_ledger"]
+    error = table.header["table_error"]
+    click.echo(f"{out}: {table.header['grain']['name']}, eta {table.header['optics']['eta']:.6g}")
+    for label, name in (
+        ("hit probability beta", "hit_probability"),
+        ("mean cosine g", "mean_cosine"),
+        ("mean z, lambda_s [R]", "mean_z"),
+        ("mean r [R]", "mean_r"),
+        ("mean chord of a miss, lambda_delta [R]", "mean_miss_chord"),
+        ("mean path length [R]", "mean_path_length"),
+        ("forward atom", "atom_forward"),
+    ):
+        click.echo(f"  {label:40s}{s[name]:.6f} +- {errors[name]:.1e}")
+    click.echo(
+        f"  {'total variation to the truth, about':40s}{error['total_variation']:.2g} "
+        f"(noise {error['sampling_noise']:.2g}, cells {error['cell_width']:.2g})"
+    )
+    leak = (ledger["lost"] + ledger["truncated"]) / ledger["launched"]
+    click.echo(f"  {'light lost or cut off':40s}{leak:.1e}")
+    if leak > 1e-6:
+        click.echo(f"warning: {leak:.1e} of the light was lost or cut off: see energy_ledger in tsdf-info", err=True)
