@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tsdf.cli.common import reports_errors
+from tsdf.cli.common import Tool
 from tsdf.errors import TSDFError, UsageError
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ class Bar:
         self._bar.close()
 
 
-@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.command("tsdf-build", cls=Tool)
 @click.argument("grain")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="The table to write, NAME.tsdf.exr.")
 @click.option(
@@ -150,7 +150,6 @@ class Bar:
     callback=_list_grains,
     help="List the built-in grains and their parameters.",
 )
-@reports_errors
 def main(
     grain: str,
     out: Path,

@@ -1,38 +1,74 @@
-"""What the commands share: errors become one line on standard error and an exit status."""
+"""What every command shares: one-line errors, exit statuses, and text from files made safe to show.
 
-import functools
+Results go to standard output, everything else to standard error. Exit status: 0 done, 1 the data or the machine
+failed, 2 the request cannot be meant, 130 interrupted. Nothing slow is imported here.
+"""
+
+import contextlib
+import os
 import sys
 import warnings
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NoReturn
 
 import click
 
 from tsdf.errors import TSDFError, UsageError
 
 
-def reports_errors(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `function` so that what is wrong is told in one line: exit status 1, or 2 for a wrong request."""
+def plain(value: Any) -> str:
+    """Return text from outside as one printable line."""
+    text = os.fsdecode(value) if isinstance(value, bytes | os.PathLike) else str(value)
+    return text if text.isprintable() else ascii(text)[1:-1]
 
-    @functools.wraps(function)
-    def reporting(*args: Any, **kwargs: Any) -> Any:
-        name = (click.get_current_context().info_name or "tsdf").removesuffix(".py")
 
-        def show(message: Warning | str, *_: Any, **__: Any) -> None:
-            click.echo(f"{name}: warning: {message}", err=True)
+class Tool(click.Command):
+    """A click command whose errors are one line, ``NAME: error: ...``; the callback may return an exit status."""
 
+    def main(
+        self, args: Sequence[str] | None = None, prog_name: str | None = None, *rest: Any, **extra: Any
+    ) -> NoReturn:
+        """Run the command and exit."""
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(AttributeError, ValueError):
+                stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
         with warnings.catch_warnings():
-            warnings.showwarning = show
-            try:
-                return function(*args, **kwargs)
-            except TSDFError as error:
-                click.echo(f"{name}: error: {error}", err=True)
-                sys.exit(2 if isinstance(error, UsageError) else 1)
-            except OSError as error:
-                click.echo(f"{name}: error: {error.filename or ''}: {error.strerror or error}", err=True)
-                sys.exit(1)
-            except KeyboardInterrupt:
-                click.echo(f"{name}: interrupted", err=True)
-                sys.exit(130)
+            warnings.simplefilter("default")
+            warnings.showwarning = lambda message, *_: self._tell("warning", message)  # type: ignore[assignment]
+            sys.exit(self._status(args, **extra))
 
-    return reporting
+    def _status(self, args: Sequence[str] | None, **extra: Any) -> int:
+        try:
+            extra["standalone_mode"] = False
+            status = super().main(args, self.name, **extra)
+            sys.stdout.flush()  # a closed pipe shows here and not at exit
+            return status if isinstance(status, int) else 0
+        except click.UsageError as error:
+            return self._tell("error", f"{error.format_message()} (see {self.name} --help)", 2)
+        except UsageError as error:
+            return self._tell("error", error, 2)
+        except click.ClickException as error:
+            return self._tell("error", error.format_message(), 1)
+        except TSDFError as error:
+            return self._tell("error", error, 1)
+        except (KeyboardInterrupt, click.Abort):
+            return self._tell("error", "interrupted", 130)
+        except BrokenPipeError:
+            with contextlib.suppress(OSError, ValueError, AttributeError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
+            return 1
+        except OSError as error:
+            name = f"{plain(error.filename)}: " if error.filename else ""
+            return self._tell("error", f"{name}{error.strerror or error}", 1)
+        except MemoryError:
+            return self._tell("error", "not enough memory", 1)
+        except Exception as error:
+            if os.environ.get("TSDF_DEBUG"):
+                raise
+            hint = "this is a bug, please report it with the traceback that TSDF_DEBUG=1 shows"
+            return self._tell("error", f"{type(error).__name__}: {error}; {hint}", 1)
+
+    def _tell(self, kind: str, message: Any, status: int = 0) -> int:
+        with contextlib.suppress(OSError):
+            click.echo(f"{self.name}: {kind}: {plain(message)}", err=True)
+        return status

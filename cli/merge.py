@@ -5,14 +5,13 @@ from pathlib import Path
 import click
 
 from tsdf.cli.build import check_output, finish
-from tsdf.cli.common import reports_errors
+from tsdf.cli.common import Tool
 
 
-@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.command("tsdf-merge", cls=Tool)
 @click.argument("parts", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="The table to write, NAME.tsdf.exr.")
 @click.option("--quiet", is_flag=True, help="No summary.")
-@reports_errors
 def main(parts: tuple[Path, ...], out: Path, quiet: bool) -> None:
     """Merge the PARTS that tsdf-build --chunk i/n wrote, in any order, into one table."""
     from tsdf.scatterometer import merge

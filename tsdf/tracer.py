@@ -12,7 +12,7 @@ function of the seed and the path's number, so paths may be traced in any order,
 import math
 from dataclasses import dataclass
 from threading import Event
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 from numba import njit
@@ -23,6 +23,7 @@ from tsdf.optics import UNPOLARISED, fresnel
 from tsdf.tally import Tally
 
 OFFSET = 1e-5  # restart distance along the geometric normal [R], measured: design notes in physics.md §6
+UNKNOWN = 2.0  # horizon of a facet of which nothing is known: no sine exceeds it
 RETRY = 1e-3  # share of the way to the facet's centroid by which a failed restart is moved
 ATOM = 1e-5  # deflections closer than this to 0 or pi are exact for float32 geometry [rad]
 SPLIT = 0.2  # a part lighter than this share of the light that enters is raised to it at random
@@ -30,10 +31,12 @@ FAN = 4  # directions in which a facet is lit from one point
 SLOTS = 16384  # rays under way at once, per thread
 MAX_BOUNCES = 100_000  # default bounce limit
 
-# State of a ray, float64: position, direction, length inside so far, entry, incoming direction
-PX, DX, LENGTH, XI, DI, STATE = 0, 3, 6, 7, 10, 13
-# and int64: weight, random key, facet, flags, hits so far, path number
-WEIGHT, KEY, FACET, FLAGS, HITS, PATH, META = 0, 1, 2, 3, 4, 5, 6
+# A ray under way: where it starts and goes, the length inside so far, the light that entered, its random key and path,
+# the facet it starts from, hits so far
+RAY = np.dtype(
+    [("p", "3f8"), ("d", "3f8"), ("entry", "3f8"), ("d_in", "3f8"), ("length", "f8"), ("key", "u8"), ("path", "i8"),
+     ("weight", "i4"), ("facet", "i4"), ("hits", "i4"), ("flags", "i4")]
+)  # fmt: skip
 INSIDE, RETRIED, MET = 1, 2, 4
 
 BOX_PHI, BOX_R, BOX_Z, BOX_L = (T.BOX[name] for name in ("phi", "r", "z", "l"))
@@ -123,29 +126,64 @@ def sobol(index: int, dimension: int, scramble: int, directions: np.ndarray) -> 
 
 
 @njit(cache=True)
-def frame(x: float, y: float, z: float) -> tuple[float, float, float, float, float, float]:
+def dot(a, b):  # type: ignore[no-untyped-def]
+    """Return the scalar product of two triples of floats."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True)
+def cross(a, b):  # type: ignore[no-untyped-def]
+    """Return the vector product of two triples of floats."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@njit(cache=True)
+def step(a, t, b):  # type: ignore[no-untyped-def]
+    """Return a + t b of two triples of floats."""
+    return a[0] + t * b[0], a[1] + t * b[1], a[2] + t * b[2]
+
+
+@njit(cache=True)
+def triple(row):  # type: ignore[no-untyped-def]
+    """Return the first three elements of an array; the compiler keeps triples in registers."""
+    return float(row[0]), float(row[1]), float(row[2])
+
+
+@njit(cache=True)
+def frame(n):  # type: ignore[no-untyped-def]
     """Return two unit vectors that complete a unit vector to a right-handed frame (Duff et al. 2017)."""
+    x, y, z = n
     sign = math.copysign(1.0, z)
     a = -1.0 / (sign + z)
     b = x * y * a
-    return 1.0 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y
+    return (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+
+
+@njit(cache=True)
+def turn(u: float) -> tuple[float, float]:
+    """Return cosine and sine of 2 pi u, u in [0, 1), to 1e-13, the same on every machine: Taylor series in quarters."""
+    quarter = int(4.0 * u + 0.5)
+    a = (u - 0.25 * quarter) * (2.0 * math.pi)
+    q = a * a
+    c = 1.0 - q / 2.0 * (1.0 - q / 12.0 * (1.0 - q / 30.0 * (1.0 - q / 56.0 * (1.0 - q / 90.0 * (1.0 - q / 132.0)))))
+    s = a * (1.0 - q / 6.0 * (1.0 - q / 20.0 * (1.0 - q / 42.0 * (1.0 - q / 72.0 * (1.0 - q / 110.0 * (1.0 - q / 156.0))))))
+    if quarter & 1:
+        c, s = -s, c
+    return (-c, -s) if quarter & 2 else (c, s)
 
 
 @njit(cache=True, nogil=True)
-def spawn(paths, at, seed, plain, directions, state, meta, origins, rays):  # type: ignore[no-untyped-def]
-    """Start the paths numbered in slots at ..: parallel light, uniform over the disc, from everywhere."""
+def spawn(paths, seed, plain, directions, rays, starts, ways):  # type: ignore[no-untyped-def]
+    """Start the paths numbered: parallel light, uniform over the disc, from everywhere."""
+    low, high = np.uint64(0xFFFFFFFF), np.uint64(32)
     for i in range(len(paths)):
         path = paths[i]
-        slot = at + i
-        replicate = path % T.REPLICATES
-        index = path // T.REPLICATES
         if plain:
-            k0, k1, k2, k3 = 11, 12, 13, 14
-            u0, u1 = unit(key_of(seed, path, k0)), unit(key_of(seed, path, k1))
-            u2, u3 = unit(key_of(seed, path, k2)), unit(key_of(seed, path, k3))
+            u0, u1 = unit(key_of(seed, path, 11)), unit(key_of(seed, path, 12))
+            u2, u3 = unit(key_of(seed, path, 13)), unit(key_of(seed, path, 14))
         else:
-            k = key_of(seed, replicate, 7)
-            low, high = np.uint64(0xFFFFFFFF), np.uint64(32)
+            index = path // T.REPLICATES
+            k = key_of(seed, path % T.REPLICATES, 7)
             k2 = mix(k + np.uint64(1))
             u0 = sobol(index, 0, k & low, directions)
             u1 = sobol(index, 1, k >> high, directions)
@@ -153,32 +191,24 @@ def spawn(paths, at, seed, plain, directions, state, meta, origins, rays):  # ty
             u3 = sobol(index, 3, k2 >> high, directions)
         dz = 1.0 - 2.0 * u0
         across = math.sqrt(max(0.0, 1.0 - dz * dz))
-        dx, dy = across * math.cos(2.0 * math.pi * u1), across * math.sin(2.0 * math.pi * u1)
-        tx, ty, tz, bx, by, bz = frame(dx, dy, dz)
-        b = math.sqrt(u2)
-        c, s, back = b * math.cos(2.0 * math.pi * u3), b * math.sin(2.0 * math.pi * u3), math.sqrt(1.0 - u2)
-        x, y, z = c * tx + s * bx - back * dx, c * ty + s * by - back * dy, c * tz + s * bz - back * dz
-        row = state[slot]
-        row[PX], row[PX + 1], row[PX + 2] = x, y, z
-        row[DX], row[DX + 1], row[DX + 2] = dx, dy, dz
-        row[LENGTH] = 0.0
-        row[XI], row[XI + 1], row[XI + 2] = x, y, z
-        row[DI], row[DI + 1], row[DI + 2] = dx, dy, dz
-        note = meta[slot]
-        note[WEIGHT] = T.UNIT
-        note[KEY] = np.int64(key_of(seed, path, 1))
-        note[FACET] = -1
-        note[FLAGS] = 0
-        note[HITS] = 0
-        note[PATH] = path
-        origins[slot, 0], origins[slot, 1], origins[slot, 2] = x, y, z
-        rays[slot, 0], rays[slot, 1], rays[slot, 2] = dx, dy, dz
+        c, s = turn(u1)
+        d = (across * c, across * s, dz)
+        t, b = frame(d)
+        radius = math.sqrt(u2)
+        c, s = turn(u3)
+        entry = step(step(step((0.0, 0.0, 0.0), radius * c, t), radius * s, b), -math.sqrt(1.0 - u2), d)
+        start(rays[i], starts[i], ways[i], entry, entry, d, entry, d, 0.0, T.UNIT, key_of(seed, path, 1), -1, 0, 0, path)
 
 
 @njit(cache=True)
-def cell(value, low, high, count):  # type: ignore[no-untyped-def]
-    """Return the uniform cell that holds `value`, clipped to 0 .. count - 1."""
-    return min(max(int((value - low) * (count / (high - low))), 0), count - 1)
+def start(ray, origin, way, p, shifted, d, entry, d_in, length, weight, key, facet, flags, hits, path):  # type: ignore[no-untyped-def]
+    """Write one ray from p along d, and for the ray engine from `shifted`."""
+    unit_length = 1.5 - 0.5 * dot(d, d)  # a step of Newton's: keeps rounding errors from piling up
+    for k in range(3):
+        ray.p[k], ray.d[k], ray.entry[k], ray.d_in[k] = p[k], d[k] * unit_length, entry[k], d_in[k]
+        origin[k], way[k] = shifted[k], d[k] * unit_length
+    ray.length, ray.weight, ray.key, ray.path = length, weight, key, path
+    ray.facet, ray.flags, ray.hits = facet, flags, hits
 
 
 @njit(cache=True)
@@ -194,7 +224,7 @@ def length_cell(length, edges):  # type: ignore[no-untyped-def]
     return k
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def arc(y: float, x: float) -> float:
     """Return atan2(y, x) to 1e-10, the same on every machine; a Chebyshev fit of atan(a) / a in a^2."""
     ay, ax = abs(y), abs(x)
@@ -215,229 +245,183 @@ def arc(y: float, x: float) -> float:
 
 
 @njit(cache=True)
-def azimuth(ax, ay, az, bx, by, bz, nx, ny, nz):  # type: ignore[no-untyped-def]
-    """Return the angle from a to b about n, both perpendicular to n [rad], 0 if either vanishes."""
-    sine = nx * (ay * bz - az * by) + ny * (az * bx - ax * bz) + nz * (ax * by - ay * bx)
-    cosine = ax * bx + ay * by + az * bz
-    return arc(sine, cosine)
+def keep(records, c, weight, key, r, z, phi, length, p, d, out):  # type: ignore[no-untyped-def]
+    """Offer the record of light that enters at p along d and leaves along `out` to the reservoir of cell `c`.
 
-
-@njit(cache=True)
-def offset(xi, di, xo, do, entry, out):  # type: ignore[no-untyped-def]
-    """Write cos theta, sin theta, r, z, phi_delta and, if `entry`, b_i^2 and the entry azimuth of one way through."""
-    cos_theta = di[0] * do[0] + di[1] * do[1] + di[2] * do[2]
-    cx, cy, cz = xo[0] - xi[0], xo[1] - xi[1], xo[2] - xi[2]
-    z = cx * di[0] + cy * di[1] + cz * di[2]
-    cx, cy, cz = cx - z * di[0], cy - z * di[1], cz - z * di[2]
-    tx, ty, tz = do[0] - cos_theta * di[0], do[1] - cos_theta * di[1], do[2] - cos_theta * di[2]
-    sin_theta = math.sqrt(tx * tx + ty * ty + tz * tz)
-    atom = sin_theta < ATOM
-    ex, ey, ez = 0.0, 0.0, 0.0
-    if entry or atom:
-        depth = xi[0] * di[0] + xi[1] * di[1] + xi[2] * di[2]
-        ex, ey, ez = xi[0] - depth * di[0], xi[1] - depth * di[1], xi[2] - depth * di[2]
-    if atom:
-        tx, ty, tz = ex, ey, ez
-    r = math.sqrt(cx * cx + cy * cy + cz * cz)
-    out[0], out[1], out[2], out[3] = cos_theta, sin_theta, r, z
-    out[4] = azimuth(tx, ty, tz, cx, cy, cz, di[0], di[1], di[2]) if r > 1e-9 else 0.0
-    if entry:
-        out[5] = min(1.0, ex * ex + ey * ey + ez * ez)
-        out[6] = azimuth(ex, ey, ez, tx, ty, tz, di[0], di[1], di[2])
-
-
-@njit(cache=True)
-def keep(records, c, weight, key, length, way):  # type: ignore[no-untyped-def]
-    """Offer one record to the reservoir of cell `c`: it stays if its key -ln(u) / weight is among the smallest."""
-    count = records.shape[1]
-    share = weight / T.UNIT
-    value = -math.log(1.0 - unit(key)) / share
-    last = count - 1  # the largest key stands last
+    It stays if its key -ln(u) / weight is among the smallest.
+    """
+    last = records.shape[1] - 1  # the largest key stands last
+    share, u = weight / T.UNIT, unit(key)
+    if u / share >= records[c, last, 0]:  # u <= -ln(1 - u), and the logarithm is dear
+        return
+    value = -math.log(1.0 - u) / share
     if value >= records[c, last, 0]:
         return
+    side = step(p, -dot(p, d), d)
     row = records[c, last]
-    row[0], row[1] = value, share
-    row[2], row[3], row[4], row[5], row[6], row[7] = way[2], way[3], way[4], length, way[5], way[6]
+    row[0], row[1], row[2], row[3], row[4], row[5] = value, share, r, z, phi, length
+    row[6] = min(1.0, dot(side, side))
+    row[7] = arc(dot(d, cross(side, out)), dot(side, out)) if c < T.COARSE else 0.0
     worst = 0
-    for k in range(1, count):
+    for k in range(1, last + 1):
         if records[c, k, 0] > records[c, worst, 0]:
             worst = k
     if worst != last:
         for k in range(T.RECORD):
-            swap = records[c, last, k]
-            records[c, last, k] = records[c, worst, k]
-            records[c, worst, k] = swap
+            records[c, last, k], records[c, worst, k] = records[c, worst, k], records[c, last, k]
 
 
 @njit(cache=True)
-def leave(p, d, length, xi, di, weight, key, path, edges, way, ends,  # type: ignore[no-untyped-def]
-          scalars, theta, cells, box, box_l, records):  # fmt: skip
-    """Count light that leaves point p along d for good; `way` (7,) and `ends` (3, 3) are scratch space."""
-    along = p[0] * d[0] + p[1] * d[1] + p[2] * d[2]
-    rest = 1.0 - (p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
-    t = math.sqrt(max(0.0, along * along + rest)) - along
-    for k in range(3):
-        ends[0, k] = p[k] + t * d[k]
-        ends[1, k] = -d[k]
-        ends[2, k] = -di[k]
+def count_offset(row, box, box_l, boxed, length, weight, r, z, phi):  # type: ignore[no-untyped-def]
+    """Count one offset in the conditionals and, if `boxed`, in the joint distributions."""
+    rc = min(int(r * (T.R / 2.0)), T.R - 1)
+    zc = min(max(int((z + 1.0) * (T.Z / 3.0)), 0), T.Z - 1)
+    row[T.AT_PHI + int(phi * (T.PHI / (2.0 * math.pi)) + (T.PHI + 0.5)) % T.PHI] += weight
+    row[T.AT_R + rc] += weight
+    row[T.AT_Z + zc] += weight
+    if boxed:
+        pb, rb, zb = int(phi * (BOX_PHI / (2.0 * math.pi)) + (BOX_PHI + 0.5)) % BOX_PHI, rc * BOX_R // T.R, zc * BOX_Z // T.Z
+        lb = min(int(length * (BOX_L / T.BOX_LENGTH)), BOX_L - 1)
+        box[pb, rb, zb] += weight
+        box_l[lb, pb] += weight
+        box_l[lb, BOX_PHI + rb] += weight
+        box_l[lb, BOX_PHI + BOX_R + zb] += weight
+
+
+@njit(cache=True)
+def rounded(x: float) -> int:
+    """Return the nearest integer."""
+    return np.int64(math.floor(x + 0.5))
+
+
+@njit(cache=True, error_model="numpy")
+def leave(p, d, length, entry, d_in, weight, key, path, edges, counters):  # type: ignore[no-untyped-def]
+    """Count light that leaves point p along d for good, as it is and walked backwards, which is as likely."""
+    scalars, theta, cells, box, box_l, records = counters
+    along = dot(p, d)
+    exit = step(p, math.sqrt(max(0.0, along * along + (1.0 - dot(p, p)))) - along, d)
+    offset = step(exit, -1.0, entry)
+    axis = cross(d_in, d)
+    cos_theta, sin_theta = dot(d_in, d), math.sqrt(dot(axis, axis))
+    z, z_back = dot(offset, d_in), dot(offset, d)
+    across, across_back = cross(offset, d_in), cross(offset, d)
+    r, r_back = math.sqrt(dot(across, across)), math.sqrt(dot(across_back, across_back))
+
+    if sin_theta < ATOM:  # no azimuth of its own: phi_delta from the side on which the light entered
+        away = 0 if cos_theta > 0.0 else 1
+        f, c, g = T.FINE + away, T.COARSE + away, T.GROUPS + away
+        side, side_back = step(entry, -dot(entry, d_in), d_in), step(exit, -dot(exit, d), d)
+        phi = arc(dot(d_in, cross(side, offset)), dot(side, offset))
+        phi_back = arc(dot(d, cross(side_back, offset)), -dot(side_back, offset))
+    else:
+        f = min(int(arc(sin_theta, cos_theta) * (T.FINE / math.pi)), T.FINE - 1)
+        c, g = f // (T.FINE // T.COARSE), f // (T.FINE // T.GROUPS)
+        sine = dot(offset, axis)
+        phi, phi_back = arc(sine, z_back - cos_theta * z), arc(sine, z - cos_theta * z_back)
+    phi = phi if r > 1e-9 else 0.0
+    phi_back = phi_back if r_back > 1e-9 else 0.0
+
     replicate = path % T.REPLICATES
-    sums = scalars[replicate]
-    recorded = records.shape[1] > 0
-    boxed = coin(path, 6) and coin(path, 7)  # a quarter of the paths tells the joint distributions well enough
+    sums, row = scalars[replicate], cells[c]
+    sums[T.SCATTERED] += weight
+    sums[T.COS_THETA] += rounded(weight * cos_theta)
+    sums[T.MEAN_R] += rounded(weight * 0.5 * (r + r_back))
+    sums[T.MEAN_Z] += rounded(weight * 0.5 * (z + z_back))
+    sums[T.PATH_LENGTH] += rounded(weight * length)
+    sums[T.OFFSET] += rounded(weight * math.sqrt(dot(offset, offset)))
+    theta[replicate, f] += weight
     lc = length_cell(length, edges)
-    lb = min(int(length * (BOX_L / T.BOX_LENGTH)), BOX_L - 1)
-    moment = np.int64(math.floor(weight * length + 0.5))
-    mean_r, mean_z = 0.0, 0.0
-    c, g, row = 0, 0, cells[0]
-    for turn in range(2):
-        if turn == 0:
-            offset(xi, di, ends[0], d, recorded, way)
-            if way[1] < ATOM:
-                back = 0 if way[0] > 0.0 else 1
-                f, c, g = T.FINE + back, T.COARSE + back, T.GROUPS + back
-            else:
-                f = min(int(arc(way[1], way[0]) * (T.FINE / math.pi)), T.FINE - 1)
-                c, g = f // (T.FINE // T.COARSE), f // (T.FINE // T.GROUPS)
-            row = cells[c]
-            theta[replicate, f] += weight
-            row[T.AT_L + lc] += weight
-            row[T.AT_L_SUM + lc] += moment
-            sums[T.SCATTERED] += weight
-            sums[T.PATH_LENGTH] += moment
-            sums[T.COS_THETA] += np.int64(math.floor(weight * way[0] + 0.5))
-            sums[T.OFFSET] += np.int64(math.floor(weight * math.sqrt(way[2] * way[2] + way[3] * way[3]) + 0.5))
-        else:  # the same path walked backwards is as likely
-            offset(ends[0], ends[1], xi, ends[2], recorded, way)
-        turned = way[4] if way[4] >= -math.pi / T.PHI else way[4] + 2.0 * math.pi
-        pc = int((turned + math.pi / T.PHI) * (T.PHI / (2.0 * math.pi))) % T.PHI
-        rc, zc = cell(way[2], 0.0, 2.0, T.R), cell(way[3], -1.0, 2.0, T.Z)
-        row[T.AT_PHI + pc] += weight
-        row[T.AT_R + rc] += weight
-        row[T.AT_Z + zc] += weight
-        mean_r += 0.5 * way[2]
-        mean_z += 0.5 * way[3]
-        if boxed:
-            half = replicate & 1
-            pb = int((turned + math.pi / BOX_PHI) * (BOX_PHI / (2.0 * math.pi))) % BOX_PHI
-            rb, zb = rc * BOX_R // T.R, zc * BOX_Z // T.Z
-            box[half, g, pb, rb, zb] += weight
-            box_l[half, g, lb, pb] += weight
-            box_l[half, g, lb, BOX_PHI + rb] += weight
-            box_l[half, g, lb, BOX_PHI + BOX_R + zb] += weight
-        if recorded:
-            keep(records, c, weight, mix(np.uint64(key) + np.uint64(0x51 + turn)), length, way)
-    sums[T.MEAN_R] += np.int64(math.floor(weight * mean_r + 0.5))
-    sums[T.MEAN_Z] += np.int64(math.floor(weight * mean_z + 0.5))
+    row[T.AT_L + lc] += weight
+    row[T.AT_L_SUM + lc] += rounded(weight * length)
+    boxed = coin(path, 6) and coin(path, 7)  # a quarter of the paths tells the joint distributions well enough
+    half = replicate & 1
+    count_offset(row, box[half, g], box_l[half, g], boxed, length, weight, r, z, phi)
+    count_offset(row, box[half, g], box_l[half, g], boxed, length, weight, r_back, z_back, phi_back)
+    if records.shape[1] > 0:
+        d_back, d_out_back = (-d[0], -d[1], -d[2]), (-d_in[0], -d_in[1], -d_in[2])
+        keep(records, c, weight, mix(key + np.uint64(0x51)), r, z, phi, length, entry, d_in, d)
+        keep(records, c, weight, mix(key + np.uint64(0x52)), r_back, z_back, phi_back, length, exit, d_back, d_out_back)
 
 
-@njit(cache=True, nogil=True)
-def advance(count, prims, sphere, horizon, eta, polarisation, reflectance_scale, split, fan_size, max_hits,  # type: ignore[no-untyped-def]
-            planes, centroids, edges, state, meta, next_state, next_meta, origins, rays, way, ends,
-            scalars, theta, cells, box, box_l, records):  # fmt: skip
+@njit(cache=True, nogil=True, error_model="numpy")
+def advance(count, prims, sphere, planes, centroids, horizon, eta, polarisation, reflectance_scale,  # type: ignore[no-untyped-def]
+            split, fan_size, max_hits, edges, rays, next_rays, starts, ways, counters):  # fmt: skip
     """Take `count` rays, whose next facets are `prims`, through one hit each; return how many go on.
 
-    What goes on is packed into next_state, next_meta and, for the ray engine, origins and rays.
+    What goes on is packed into next_rays and, for the ray engine, starts and ways.
     """
     live = 0
-    p, d, n = np.empty(3), np.empty(3), np.empty(3)
-    out, into, from_x, from_d = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    tx, ty, tz, bx, by, bz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(count):
-        row, note = state[i], meta[i]
-        weight, key, flags, path = note[WEIGHT], np.uint64(note[KEY]), note[FLAGS], note[PATH]
-        inside = (flags & INSIDE) != 0
-        facet = prims[i]
-        for k in range(3):
-            p[k], d[k] = row[PX + k], row[DX + k]
-        xi, di, length = row[XI : XI + 3], row[DI : DI + 3], row[LENGTH]
-        sums = scalars[path % T.REPLICATES]
+        ray, facet = rays[i], prims[i]
+        p, d, entry, d_in = triple(ray.p), triple(ray.d), triple(ray.entry), triple(ray.d_in)
+        length, path, key, weight = ray.length, ray.path, ray.key, np.int64(ray.weight)
+        inside, met = (ray.flags & INSIDE) != 0, (ray.flags & MET) != 0
+        sums = counters[0][path % T.REPLICATES]
 
         if facet < 0 and not inside:
-            if flags & MET:
-                leave(p, d, length, xi, di, weight, key, path, edges, way, ends,
-                      scalars, theta, cells, box, box_l, records)  # fmt: skip
+            if met:
+                leave(p, d, length, entry, d_in, weight, key, path, edges, counters)
             else:
-                chord = -2.0 * (p[0] * d[0] + p[1] * d[1] + p[2] * d[2])
                 sums[T.UNSCATTERED] += weight
-                sums[T.MISS_CHORD] += np.int64(math.floor(weight * chord + 0.5))
+                sums[T.MISS_CHORD] += rounded(weight * -2.0 * dot(p, d))
             continue
 
         # The hit, on the facet's plane (or the sphere), with its normal
         lost = facet < 0
-        cosine, t = 0.0, 0.0
-        if not lost:
-            if sphere:
-                t = -2.0 * (p[0] * d[0] + p[1] * d[1] + p[2] * d[2]) if inside else 0.0
-                norm = 0.0
-                for k in range(3):
-                    n[k] = p[k] + t * d[k]
-                    norm += n[k] * n[k]
-                norm = math.sqrt(norm)
-                for k in range(3):
-                    n[k] /= norm
-                cosine = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
-            else:
-                n[0], n[1], n[2] = planes[facet, 0], planes[facet, 1], planes[facet, 2]
-                cosine = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
-                if cosine != 0.0:
-                    t = (planes[facet, 3] - (n[0] * p[0] + n[1] * p[1] + n[2] * p[2])) / cosine
-            lost = (cosine > 0.0) != inside or cosine == 0.0 or t < -10.0 * OFFSET or t > 2.5
-        if lost and not sphere:
+        n, cosine, t = (0.0, 0.0, 0.0), 0.0, 0.0
+        if sphere:
+            t = -2.0 * dot(p, d) if inside else 0.0
+            n = step(p, t, d)
+            n = step((0.0, 0.0, 0.0), 1.0 / math.sqrt(dot(n, n)), n)
+            cosine = dot(n, d)
+        elif not lost:
+            n = triple(planes[facet])
+            cosine = dot(n, d)
+            t = (planes[facet, 3] - dot(n, p)) / cosine
+        if lost or (cosine > 0.0) != inside or not (-10.0 * OFFSET <= t <= 2.5):
             # A leak at an edge or a vertex: once more from nearer the middle of the facet it came from
-            start = note[FACET]
-            if start < 0 or flags & RETRIED:
+            if ray.facet < 0 or ray.flags & RETRIED:
                 sums[T.LOST] += weight
             else:
-                side = -OFFSET if inside else OFFSET
-                next_state[live] = row
-                next_meta[live] = note
-                next_meta[live, FLAGS] = flags | RETRIED
-                for k in range(3):
-                    moved = p[k] + RETRY * (centroids[start, k] - p[k])
-                    origins[live, k] = moved + side * planes[start, k]
-                    rays[live, k] = d[k]
+                moved = step(p, RETRY, step(triple(centroids[ray.facet]), -1.0, p))
+                moved = step(moved, -OFFSET if inside else OFFSET, triple(planes[ray.facet]))
+                start(next_rays[live], starts[live], ways[live], p, moved, d, entry, d_in, length, weight, key,
+                      ray.facet, ray.flags | RETRIED, ray.hits, path)  # fmt: skip
                 live += 1
             continue
 
         t = max(t, 0.0)
-        for k in range(3):
-            p[k] = n[k] if sphere else p[k] + t * d[k]
+        p = n if sphere else step(p, t, d)
         if inside:
             length += t
-        hits = note[HITS] + 1
+        hits = ray.hits + 1
         if hits > max_hits:
             sums[T.TRUNCATED] += weight
             continue
 
         # Above the horizon of a facet light comes unobstructed: one point, several directions
         low = horizon[facet]
-        fan = 1 if inside or flags & MET or -cosine <= low else fan_size
+        fan = 1 if inside or met or -cosine <= low else fan_size
+        weight //= fan
         full = 1.0 - low * low
         u, turn_c, turn_s = 0.0, 1.0, 0.0
+        tangent, bitangent = d, d
         if fan > 1:
-            weight //= fan
-            tx, ty, tz, bx, by, bz = frame(n[0], n[1], n[2])
-            c, s = d[0] * tx + d[1] * ty + d[2] * tz, d[0] * bx + d[1] * by + d[2] * bz
+            tangent, bitangent = frame(n)
+            c, s = dot(d, tangent), dot(d, bitangent)
             u = min(c * c + s * s, full)
             around = math.sqrt(u)
             turn_c, turn_s = (c / around, s / around) if around > 0.0 else (1.0, 0.0)
-        for ray in range(fan):
-            if ray > 0:
+        for k in range(fan):
+            if k > 0:
                 # Lambert's projection turned by the golden angle and shifted by 1 / fan: uniform again
                 u = u + full / fan if u + full / fan < full else u + full / fan - full
                 turn_c, turn_s = turn_c * GOLDEN_C - turn_s * GOLDEN_S, turn_s * GOLDEN_C + turn_c * GOLDEN_S
-                c, s, cosine = math.sqrt(u) * turn_c, math.sqrt(u) * turn_s, -math.sqrt(1.0 - u)
-                d[0] = c * tx + s * bx + cosine * n[0]
-                d[1] = c * ty + s * by + cosine * n[1]
-                d[2] = c * tz + s * bz + cosine * n[2]
-                along = p[0] * d[0] + p[1] * d[1] + p[2] * d[2]
-                rest = 1.0 - (p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
-                t = math.sqrt(max(0.0, along * along + rest)) + along
-                for k in range(3):
-                    from_x[k], from_d[k] = p[k] - t * d[k], d[k]
-                xi, di = from_x, from_d
-                if cosine == 0.0:
-                    cosine = -1e-300
+                cosine = -math.sqrt(max(1.0 - u, 1e-300))
+                d = step(step(step((0.0, 0.0, 0.0), math.sqrt(u) * turn_c, tangent), math.sqrt(u) * turn_s, bitangent),
+                         cosine, n)  # fmt: skip
+                along = dot(p, d)
+                entry, d_in = step(p, -along - math.sqrt(max(0.0, along * along + (1.0 - dot(p, p)))), d), d
 
             # Reflection and refraction; one of the two goes on outside (out), the other inside (into)
             ratio = 1.0 / eta if inside else eta
@@ -446,48 +430,33 @@ def advance(count, prims, sphere, horizon, eta, polarisation, reflectance_scale,
             total = reflectance >= 1.0
             if not total:
                 reflectance = min(reflectance * reflectance_scale, 1.0)
-            sign = 1.0 if cosine > 0.0 else -1.0
-            for k in range(3):
-                mirrored = d[k] - 2.0 * cosine * n[k]
-                bent = d[k] if ratio == 1.0 else d[k] / ratio + sign * (cos_t - cos_i / ratio) * n[k]
-                out[k], into[k] = (bent, mirrored) if inside else (mirrored, bent)
-            mirrored_weight = weight if total else np.int64(math.floor(weight * reflectance + 0.5))
+            mirrored = step(d, -2.0 * cosine, n)
+            bent = d
+            if ratio != 1.0:
+                bend = cos_t - cos_i / ratio
+                bent = step(step((0.0, 0.0, 0.0), 1.0 / ratio, d), bend if cosine > 0.0 else -bend, n)
+            out, into = (bent, mirrored) if inside else (mirrored, bent)
+            mirrored_weight = weight if total else rounded(weight * reflectance)
             out_weight = weight - mirrored_weight if inside else mirrored_weight
             key = mix(key + np.uint64(0x9E3779B97F4A7C15))
             lighter = min(out_weight, weight - out_weight)
             least = min(split, weight)
-            outward = out[0] * n[0] + out[1] * n[1] + out[2] * n[2]
-            free = outward > low or low == 0.0
+            free = dot(out, n) > low or low == 0.0
             if 0 < lighter < least and not (free and weight > split and out_weight == lighter):
                 kept = least if unit(key) * least < lighter else 0
                 out_weight = kept if lighter == out_weight else weight - kept
-            into_weight = weight - out_weight
-
             if out_weight > 0:
                 if free:
-                    leave(p, out, length, xi, di, out_weight, key, path, edges, way, ends,
-                          scalars, theta, cells, box, box_l, records)  # fmt: skip
+                    leave(p, out, length, entry, d_in, out_weight, key, path, edges, counters)
                 else:
-                    go_on(next_state[live], next_meta[live], origins[live], rays[live], p, out, n, length, xi, di,
-                          out_weight, mix(key ^ np.uint64(0xA5A5A5A5A5A5A5A5)), facet, MET, hits, path, OFFSET)  # fmt: skip
+                    start(next_rays[live], starts[live], ways[live], p, step(p, OFFSET, n), out, entry, d_in, length,
+                          out_weight, mix(key ^ np.uint64(0xA5A5A5A5A5A5A5A5)), facet, MET, hits, path)  # fmt: skip
                     live += 1
-            if into_weight > 0:
-                go_on(next_state[live], next_meta[live], origins[live], rays[live], p, into, n, length, xi, di,
-                      into_weight, key, facet, MET | INSIDE, hits, path, -OFFSET)  # fmt: skip
+            if out_weight < weight:
+                start(next_rays[live], starts[live], ways[live], p, step(p, -OFFSET, n), into, entry, d_in, length,
+                      weight - out_weight, key, facet, MET | INSIDE, hits, path)  # fmt: skip
                 live += 1
     return live
-
-
-@njit(cache=True)
-def go_on(state, meta, origin, ray, p, d, n, length, xi, di, weight, key, facet, flags, hits, path, shift):  # type: ignore[no-untyped-def]
-    """Write one ray that starts at point p of `facet` along d, moved by `shift` along the normal for the engine."""
-    norm = 1.0 / math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-    for k in range(3):
-        state[PX + k], state[DX + k] = p[k], d[k] * norm
-        state[XI + k], state[DI + k] = xi[k], di[k]
-        origin[k], ray[k] = p[k] + shift * n[k], d[k] * norm
-    state[LENGTH] = length
-    meta[WEIGHT], meta[KEY], meta[FACET], meta[FLAGS], meta[HITS], meta[PATH] = weight, key, facet, flags, hits, path
 
 
 @njit(cache=True, nogil=True)
@@ -590,7 +559,7 @@ class Tracer:
     split: float = SPLIT
     fan: int = FAN
     slots: int = SLOTS
-    log: Any = None
+    log: Callable[[np.ndarray, np.ndarray], None] | None = None
 
     def __post_init__(self) -> None:
         self._sphere = self.grain.kind == "sphere"
@@ -605,24 +574,25 @@ class Tracer:
             self._centroids = corners.mean(axis=1)
             height = np.einsum("ij,ij->i", normals, self._centroids)
             self._planes = np.ascontiguousarray(np.column_stack((normals, height)))
-            self._horizon = horizon_of(self.grain.vertices, self.grain.faces, self._planes)
+            self._horizon = (
+                np.full(len(normals), UNKNOWN) if self.plain
+                else horizon_of(self.grain.vertices, self.grain.faces, self._planes)
+            )  # fmt: skip
             self._scene = embree_scene(self.grain)
-        self._capacity = 0
+        self._rays, self._next = np.empty(0, RAY), np.empty(0, RAY)
         self._reserve((1 + self.fan) * self.slots)
 
     def _reserve(self, capacity: int) -> None:
-        if capacity <= self._capacity:
+        """Make room for that many rays, keeping those under way."""
+        if capacity <= len(self._rays):
             return
-        old = self._capacity
-        grown = [np.empty((capacity, STATE)), np.empty((capacity, STATE))]
-        notes = [np.empty((capacity, META), dtype=np.int64), np.empty((capacity, META), dtype=np.int64)]
-        origins, rays = np.empty((capacity, 3), np.float32), np.empty((capacity, 3), np.float32)
-        if old:
-            for new, mine in zip(grown + notes, self._states + self._metas, strict=True):
-                new[:old] = mine
-            origins[:old], rays[:old] = self._origins, self._rays
-        self._states, self._metas, self._origins, self._rays = grown, notes, origins, rays
-        self._capacity = capacity
+        old = len(self._rays)
+        kept = self._rays, *((self._starts, self._ways) if old else ())
+        self._rays, self._next = np.empty(capacity, RAY), np.empty(capacity, RAY)
+        self._starts, self._ways = np.empty((capacity, 3), np.float32), np.empty((capacity, 3), np.float32)
+        self._always = np.zeros(capacity, dtype=np.int32)
+        for new, mine in zip((self._rays, self._starts, self._ways), kept, strict=False):
+            new[:old] = mine
 
     def trace(self, paths: np.ndarray, tally: Tally, stop: Event | None = None) -> int:
         """Trace the paths of the numbers given, (n,) int64, into `tally`; return the number of rays that took.
@@ -632,31 +602,23 @@ class Tracer:
         counters = (tally.scalars, tally.theta, tally.cells, tally.box, tally.box_l, tally.records)
         fan = 1 if self.plain else self.fan
         split = np.int64(T.UNIT if self.plain else self.split * T.UNIT / fan)
-        way, ends = np.empty(7), np.empty((3, 3))
-        first, live, total, mine = 0, 0, 0, 0
-        forever = np.zeros(self._capacity, dtype=np.int32)
+        first, live, total = 0, 0, 0
         tally.scalars[:, T.LAUNCHED] += T.UNIT * np.bincount(paths % T.REPLICATES, minlength=T.REPLICATES)
         while (live or first < len(paths)) and not (stop is not None and stop.is_set()):
             if live < self.slots // 2 and first < len(paths):
                 fresh = paths[first : first + self.slots - live]
-                spawn(fresh, live, self.seed, self.plain, SOBOL,
-                      self._states[mine], self._metas[mine], self._origins, self._rays)  # fmt: skip
+                spawn(fresh, self.seed, self.plain, SOBOL, self._rays[live:], self._starts[live:], self._ways[live:])
                 first, live = first + len(fresh), live + len(fresh)
             self._reserve((1 + self.fan) * live)
-            if self._sphere:
-                if len(forever) < live:
-                    forever = np.zeros(self._capacity, dtype=np.int32)
-                prims = forever[:live]
-            else:
-                prims = self._scene.run(self._origins[:live], self._rays[:live])
+            starts, ways = self._starts[:live], self._ways[:live]
+            prims = self._always[:live] if self._sphere else self._scene.run(starts, ways)
             if self.log is not None:
-                self.log(self._origins[:live], self._rays[:live])
+                self.log(starts, ways)
             total += live
             live = advance(
-                live, prims, self._sphere, self._horizon, self.eta, self._polarisation, self.reflectance_scale,
-                split, fan, self.max_bounces, self._planes, self._centroids, T.L_EDGES,
-                self._states[mine], self._metas[mine], self._states[1 - mine], self._metas[1 - mine],
-                self._origins, self._rays, way, ends, *counters,
+                live, prims, self._sphere, self._planes, self._centroids, self._horizon, self.eta, self._polarisation,
+                self.reflectance_scale, split, fan, self.max_bounces, T.L_EDGES, self._rays, self._next,
+                self._starts, self._ways, counters,
             )  # fmt: skip
-            mine = 1 - mine
+            self._rays, self._next = self._next, self._rays
         return total

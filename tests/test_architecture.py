@@ -1,0 +1,98 @@
+"""The layout is what the design says: imports point one way, each heavy third party has one door, nothing slow loads."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import tsdf
+
+PACKAGE = Path(tsdf.__file__).parent
+ROOT = PACKAGE.parent
+
+# What each module may import of the package: only what stands below it.
+LAYERS = [
+    {"errors"},
+    {"optics", "materials", "table", "tally", "analytic", "exemplars"},
+    {"grains", "format"},
+    {"tracer", "estimate"},
+    {"scatterometer", "validate", "plots"},
+]
+DOORS = {
+    "trimesh": {"grains"},
+    "embreex": {"grains"},
+    "OpenEXR": {"format"},
+    "matplotlib": {"plots"},
+    "jsonschema": {"format"},
+}
+
+
+def imports(path: Path) -> list[tuple[str, bool]]:
+    """Return the modules a file imports and whether at its top level."""
+    tree = ast.parse(path.read_text())
+    top = set(map(id, tree.body))
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found += [(alias.name, id(node) in top) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names = [f"tsdf.{a.name}" for a in node.names] if node.module == "tsdf" else [node.module]
+            found += [(name, id(node) in top) for name in names]
+    return found
+
+
+def modules() -> list[Path]:
+    return sorted(p for p in PACKAGE.glob("*.py") if p.name != "__init__.py")
+
+
+def test_every_module_has_a_layer() -> None:
+    assert {p.stem for p in modules()} == set().union(*LAYERS)
+
+
+@pytest.mark.parametrize("path", modules(), ids=lambda p: p.stem)
+def test_imports_point_down(path: Path) -> None:
+    """A module imports only modules of lower layers, or of its own layer without a circle (`table` and the like)."""
+    layer = next(i for i, names in enumerate(LAYERS) if path.stem in names)
+    below = set().union(*LAYERS[:layer])
+    same = LAYERS[layer]
+    for name, _ in imports(path):
+        if name.startswith("tsdf.") and name.split(".")[1] not in ("reference_data", "schema"):
+            target = name.split(".")[1]
+            assert target in below | same and target != path.stem, f"{path.stem} imports {target}"
+
+
+def test_the_judge_does_not_import_the_judged() -> None:
+    """`analytic` says what the answer should be, so it shares nothing with what computes it but the errors."""
+    own = {name for name, _ in imports(PACKAGE / "analytic.py") if name.startswith("tsdf")}
+    assert own == {"tsdf.errors"}
+
+
+@pytest.mark.parametrize("third_party", DOORS)
+def test_one_door_for_each_heavy_third_party(third_party: str) -> None:
+    """Each is imported by one module, inside functions, so that nothing pays for it who does not use it."""
+    for path in modules():
+        for name, at_top in imports(path):
+            if name.split(".")[0] == third_party:
+                assert path.stem in DOORS[third_party], f"{path.stem} imports {third_party}"
+                assert not at_top, f"{path.stem} imports {third_party} at its top"
+
+
+def test_library_does_not_import_the_command_line() -> None:
+    for path in modules():
+        assert not any(name.startswith(("click", "tsdf.cli")) for name, _ in imports(path)), path
+
+
+@pytest.mark.parametrize("command", ["build", "info", "merge", "plot", "validate"])
+def test_help_loads_nothing_slow(command: str) -> None:
+    """``--help`` is instant because no array library is loaded for it."""
+    code = (
+        f"import sys; from tsdf.cli.{command} import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "print(sorted({'numpy', 'numba', 'trimesh', 'matplotlib', 'OpenEXR', 'scipy'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert "--help" in done.stdout

@@ -1,0 +1,204 @@
+"""``tsdf-build`` and ``tsdf-merge`` as a user meets them: what they print, refuse and leave behind."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+import tsdf
+from tsdf.cli.build import main as build
+from tsdf.cli.merge import main as merge
+
+FAST = ["--eta", "1.31", "--paths", "10000", "--quiet"]
+
+
+def run(*words: str | Path) -> Result:
+    return CliRunner().invoke(build, [str(word) for word in words], prog_name="tsdf-build")
+
+
+def one_line(result: Result) -> str:
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    assert result.stdout == "" and result.stderr.count("\n") == 1, result.stderr
+    return result.stderr
+
+
+def test_sphere(tmp_path: Path) -> None:
+    out = tmp_path / "s.tsdf.exr"
+    result = run("sphere", "--eta", "1.33", "--out", out)
+    assert result.exit_code == 0 and "0.766749" in result.stdout and result.stderr == ""
+    assert [p.name for p in tmp_path.iterdir()] == [out.name]
+    table = tsdf.read(out)
+    assert table.header["provenance"]["method"] == "exact"
+    assert table.header["provenance"]["command"] == "tsdf-build sphere --eta 1.33 --fresnel un"
+
+
+def test_the_recorded_command_makes_the_same_bytes(tmp_path: Path) -> None:
+    first, second = tmp_path / "1.exr", tmp_path / "2.exr"
+    words = ["hexprism", "--set", "aspect=0.5", "--material", "ice", "--wavelength-nm", "600", "--joint", "3"]
+    assert run(*words, "--paths", "12000", "--quiet", "--out", first).exit_code == 0
+    command = tsdf.read(first).header["provenance"]["command"].split()
+    assert command[0] == "tsdf-build"
+    assert run(*command[1:], "--quiet", "--threads", "1", "--out", second).exit_code == 0
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_material_is_recorded(tmp_path: Path) -> None:
+    out = tmp_path / "s.exr"
+    assert run("sphere", "--material", "ice", "--wavelength-nm", "600", "--out", out).exit_code == 0
+    optics = tsdf.read(out).header["optics"]
+    assert optics["eta"] == pytest.approx(1.3094, abs=1e-4) and optics["k"] == pytest.approx(5.73e-9, rel=0.01)
+    assert optics["material"] == "ice" and "Warren" in optics["source"]
+
+
+def test_progress_and_summary(tmp_path: Path) -> None:
+    result = run("cube", "--eta", "1.31", "--paths", "20000", "--out", tmp_path / "c.exr")
+    assert result.exit_code == 0
+    assert "total variation" in result.stderr and "paths/s" in result.stderr
+    assert "light lost or cut off" in result.stdout
+    quiet = run("cube", *FAST, "--out", tmp_path / "q.exr")
+    assert quiet.exit_code == 0 and quiet.stdout == quiet.stderr == ""
+
+
+def test_grains_are_listed() -> None:
+    result = CliRunner().invoke(build, ["--grains"])
+    assert result.exit_code == 0
+    for name in ("sphere", "cube", "hexprism", "octahedron", "ellipsoid", "sand", "snow"):
+        assert f"{name}: " in result.stdout
+    assert "bevel=0 " in result.stdout and "gamma=35" in result.stdout
+
+
+def test_parts_and_merge(tmp_path: Path) -> None:
+    parts = []
+    for i in (1, 2):
+        parts.append(str(tmp_path / f"{i}.part"))
+        assert run("cube", *FAST, "--chunk", f"{i}/2", "--out", parts[-1]).exit_code == 0
+    whole, merged = tmp_path / "whole.exr", tmp_path / "merged.exr"
+    assert run("cube", *FAST, "--out", whole).exit_code == 0
+    result = CliRunner().invoke(merge, [*parts[::-1], "--out", str(merged), "--quiet"])
+    assert result.exit_code == 0 and merged.read_bytes() == whole.read_bytes()
+    result = CliRunner().invoke(merge, [parts[0], "--out", str(tmp_path / "x.exr")])
+    assert result.exit_code == 1 and "missing" in one_line(result)
+    assert not (tmp_path / "x.exr").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_says_what_is_safe(number: int, tmp_path: Path) -> None:
+    out = tmp_path / "i.tsdf.exr"
+    command = [sys.executable, "-c", "from tsdf.cli.build import main; main()"]
+    command += ["cube", "--eta", "1.31", "--paths", "1e9", "--threads", "1", "--quiet", "--out", str(out)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 60
+    while not Path(f"{out}.part").exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.send_signal(number)
+    _, message = process.communicate(timeout=60)
+    assert process.returncode == 128 + number
+    assert message.count("\n") == 1 and "--resume" in message and "paths are safe" in message
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        (["cube", "--eta", "0"], 2, "eta"),
+        (["cube", "--eta", "nan"], 2, "eta"),
+        (["cube", "--eta", "-1.3"], 2, "eta"),
+        (["cube", "--paths", "0"], 2, "paths"),
+        (["cube", "--paths", "1e30"], 2, "paths"),
+        (["cube", "--paths", "1.5"], 2, "whole number"),
+        (["cube", "--paths", "many"], 2, "whole number"),
+        (["cube", "--chunk", "3/2"], 2, "--chunk"),
+        (["cube", "--chunk", "1/2", "--target-error", "0.1"], 2, "--paths"),
+        (["cube", "--eta", "1.3", "--material", "ice"], 2, "not both"),
+        (["cube", "--material", "gold"], 2, "sucrose"),
+        (["cube", "--material", "ice", "--wavelength-nm", "3"], 2, "wavelength"),
+        (["cube", "--eta", "1.3", "--wavelength-nm", "500"], 2, "--material"),
+        (["cube", "--fresnel", "sp", "--paths", "5000"], 2, "sphere"),
+        (["cube", "--fresnel", "xx"], 2, "--fresnel"),
+        (["cube", "--set", "bevel=2"], 2, "bevel"),
+        (["cube", "--set", "bevvel=0.1"], 2, "bevel"),
+        (["cube", "--set", "bevel"], 2, "NAME=VALUE"),
+        (["cube", "--traced"], 2, "sphere"),
+        (["cube", "--threads", "0"], 2, "threads"),
+        (["cube", "--no-such-option"], 2, "--no-such-option"),
+        (["sphere", "--paths", "5000"], 2, "--traced"),
+        (["sphere", "--target-error", "1e-6"], 2, "out of reach"),
+        (["no-such-grain"], 1, "built-in grains"),
+    ],
+)
+def test_bad_requests(words: list[str], status: int, said: str, tmp_path: Path) -> None:
+    result = run(*words, "--out", tmp_path / "x.exr")
+    assert result.exit_code == status
+    assert said in one_line(result)
+    assert not list(tmp_path.iterdir())
+
+
+def test_unwritable_outputs(tmp_path: Path) -> None:
+    for out in (tmp_path / "none" / "x.exr", tmp_path, Path("/dev/full")):
+        result = run("cube", *FAST, "--out", out)
+        assert result.exit_code == 1 and "cannot write" in one_line(result)
+
+
+def test_full_disk_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The part file cannot be moved into place: one line, nothing half-written, what stood there stays."""
+    out = tmp_path / "x.exr"
+    out.write_bytes(b"before")
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    result = run("cube", *FAST, "--out", out)
+    assert result.exit_code == 1 and "No space left" in one_line(result)
+    assert [p.name for p in tmp_path.iterdir()] == ["x.exr"] and out.read_bytes() == b"before"
+
+
+def test_unfinished_builds_are_not_lost(tmp_path: Path) -> None:
+    out = tmp_path / "x.exr"
+    assert run("cube", *FAST, "--chunk", "1/2", "--out", f"{out}.part").exit_code == 0
+    kept = Path(f"{out}.part").read_bytes()
+    result = run("cube", *FAST, "--out", out)
+    assert result.exit_code == 1 and "--resume" in one_line(result)
+    result = run("cube", "--eta", "1.5", "--paths", "10000", "--quiet", "--resume", "--out", out)
+    assert result.exit_code == 1 and "differ in optics" in one_line(result)
+    assert Path(f"{out}.part").read_bytes() == kept
+    assert run("cube", *FAST, "--resume", "--out", out).exit_code == 0
+    assert not Path(f"{out}.part").exists()
+
+
+def test_meshes_from_files(tmp_path: Path) -> None:
+    """The same octahedron as a file, at another size and place, is the same table to the rounding of the file."""
+    from tsdf.grains import load_grain
+
+    grain = load_grain("octahedron")
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in (grain.vertices * 1e-6 + 1e-3).tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (grain.faces + 1).tolist()]
+    (tmp_path / "o.obj").write_text("\n".join(lines))
+    assert run(tmp_path / "o.obj", *FAST, "--out", tmp_path / "file.exr").exit_code == 0
+    assert run("octahedron", *FAST, "--out", tmp_path / "named.exr").exit_code == 0
+    one, other = tsdf.read(tmp_path / "file.exr"), tsdf.read(tmp_path / "named.exr")
+    assert one.header["grain"]["name"] == "o.obj" and one.header["grain"]["bounding_radius"] == pytest.approx(1e-6)
+    assert np.abs(one.p_theta - other.p_theta).max() < 1e-5
+    for name in ("mean_cosine", "mean_r", "hit_probability", "mean_path_length"):
+        assert one.statistics[name] == pytest.approx(other.statistics[name], abs=1e-5)
+
+
+def test_open_mesh_and_repair(tmp_path: Path) -> None:
+    from tsdf.grains import load_grain
+
+    grain = load_grain("icosphere", subdivisions=2)
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in grain.vertices.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (grain.faces[1:] + 1).tolist()]
+    (tmp_path / "open.obj").write_text("\n".join(lines))
+    result = run(tmp_path / "open.obj", *FAST, "--out", tmp_path / "x.exr")
+    assert result.exit_code == 1 and "3 boundary edges" in one_line(result) and "--repair" in result.stderr
+    words = ["--eta", "1.31", "--paths", "10000", "--repair"]
+    result = run(tmp_path / "open.obj", *words, "--out", tmp_path / "x.exr")
+    assert result.exit_code == 0 and "note: repair" in result.stderr
+    assert any("repair" in note for note in tsdf.read(tmp_path / "x.exr").header["grain"]["notes"])

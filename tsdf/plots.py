@@ -1,0 +1,327 @@
+"""Pictures of tables, by matplotlib, which is imported here and nowhere else, and only when a picture is drawn.
+
+Figures are made without pyplot, so nothing global changes, and `save` writes the same bytes for the same table.
+"""
+
+import io
+import math
+import os
+import secrets
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tsdf import analytic
+from tsdf.errors import TSDFError, UsageError
+from tsdf.table import Table
+from tsdf.validate import ROUNDING, ZHOU_ETA, henyey_greenstein, reference
+
+SUFFIXES = (".png", ".pdf")
+DPI = 160
+DECADES = 3.0  # range of the colours below the largest density
+SHOWN = 0.999  # share of the light whose path lengths are in the picture
+STRIP = (0.05, 0.10)  # distance from the axis and width of an atom's strip [cos theta]
+STYLE: Any = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8.5,
+    "axes.titlesize": 9.5,
+    "axes.linewidth": 0.7,
+    "mathtext.fontset": "dejavusans",
+    "svg.hashsalt": "tsdf",
+}
+
+
+def check_suffix(path: str | os.PathLike[str]) -> str:
+    """Return the format that a file name asks for, "png" or "pdf".
+
+    Raises
+    ------
+    UsageError
+        If it is another.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise UsageError(f"{os.fspath(path)}: a picture is a .png or a .pdf file, not {suffix or 'without suffix'!r}")
+    return suffix[1:]
+
+
+def save(figure: Any, path: str | os.PathLike[str]) -> None:
+    """Write a figure; the same figure gives the same bytes, and a file at `path` is replaced only by a whole one.
+
+    Raises
+    ------
+    TSDFError
+        If the file cannot be written; nothing is left behind.
+    """
+    import matplotlib
+
+    kind = check_suffix(path)
+    unstamped = {"png": {"Software": None}, "pdf": {"CreationDate": None, "Producer": None, "Creator": None}}
+    buffer = io.BytesIO()
+    with matplotlib.rc_context(STYLE):
+        figure.savefig(buffer, format=kind, dpi=DPI, metadata=unstamped[kind])
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(f".{secrets.token_hex(8)}.tmp")
+    try:
+        if target.exists() and not target.is_file():
+            raise OSError("there is something other than a regular file")
+        try:
+            temporary.write_bytes(buffer.getvalue())
+            os.replace(temporary, target)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise TSDFError(f"cannot write {os.fspath(path)}: {reason}; check the directory and the permissions") from error
+
+
+def plot_table(table: Table) -> Any:
+    """Return a matplotlib Figure of all distributions of a table, as Fig. 1 of Meng et al. 2015.
+
+    p_theta as a density over cos theta, and the conditional densities of phi_Delta, r, z and the path length as
+    colours over cos theta. Cells are drawn at their true edges. Light in an atom of cos theta stands in a strip beside
+    the axis; path lengths go as far as 99.9 % of the light.
+    """
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(7.2, 7.6), layout="constrained")
+        figure.suptitle(_title(table), fontsize=10)
+        grid = figure.add_gridspec(3, 2, height_ratios=(1.0, 1.0, 1.0))
+        _p_theta(figure.add_subplot(grid[0, :]), table)
+        pi = math.pi
+        quarters = {0.0: "0", pi / 2: r"$\pi/2$", pi: r"$\pi$", 1.5 * pi: r"$3\pi/2$"}
+        for place, name, label, ticks in (
+            (grid[1, 0], "p_phi", r"$\phi_\Delta$ [rad]", quarters),
+            (grid[1, 1], "p_r", r"$r$ [R]", None),
+            (grid[2, 0], "p_z", r"$z$ [R]", None),
+            (grid[2, 1], "p_l", r"path length $l$ [R]", None),
+        ):
+            _conditional(figure, figure.add_subplot(place), table, name, label, ticks)
+    return figure
+
+
+def plot_validation(table: Table) -> Any:
+    """Return a matplotlib Figure of p_theta beside what it should be.
+
+    A sphere's is drawn as Zhou, Li & Stamnes 2003 draw their Fig. 8, with the deviation of the cells below. Any other
+    grain's is drawn with its stated error and the Henyey-Greenstein lobes of its header.
+    """
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(6.4, 5.4), layout="constrained")
+        figure.suptitle(_title(table), fontsize=10)
+        if table.header["grain"]["kind"] == "sphere":
+            above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3.2, 1.0))
+            _phase_function(above, table)
+            _deviation(below, table)
+        else:
+            _fits(figure.subplots(), table)
+    return figure
+
+
+def _title(table: Table) -> str:
+    header = table.header
+    grain, optics, error = header["grain"], header["optics"], header["table_error"]
+    paths = header["provenance"]["paths"]
+    made = f"{paths:,} paths" if paths else "quadrature"
+    name = _literal(grain["name"])
+    total = error["total_variation"]
+    return (
+        f"{name}, $\\eta$ = {optics['eta']:.6g}, Fresnel {optics['fresnel']}, {made}\n"
+        f"stated error {total:.2g} (noise {error['sampling_noise']:.2g}, cell width {error['cell_width']:.2g})"
+    )
+
+
+def _literal(text: str) -> str:
+    """Return text from a header as matplotlib shows it literally: no mathematics, one line, not too long."""
+    text = text if text.isascii() and text.isprintable() else ascii(text)[1:-1]
+    return (text if len(text) <= 40 else f"{text[:37]}...").replace("$", r"\$")
+
+
+def _steps(axes: Any, edges: np.ndarray, density: np.ndarray, **style: Any) -> None:
+    """Draw a density as steps; cells without any leave a gap on a log axis."""
+    axes.stairs(np.where(density > 0.0, density, np.nan), edges, baseline=None, **style)
+
+
+def _density(table: Table) -> tuple[np.ndarray, np.ndarray]:
+    """Return the edges of the columns that are not atoms, and the density of cos theta in them."""
+    edges = table.cos_theta_edges[1:-1]
+    return edges, table.p_theta[1:-1] / np.diff(edges)
+
+
+def _p_theta(axes: Any, table: Table) -> None:
+    edges, density = _density(table)
+    axes.set_xlim(-1.0, 1.0)
+    if density.any():
+        _steps(axes, edges, density, color="black", linewidth=1.0)
+        axes.set_yscale("log")
+        low, high = density[density > 0.0].min(), density.max()
+        axes.set_ylim(max(low, high * 1e-6) / 1.5, high * 3.0)
+    else:
+        axes.set_yticks([])
+    _atoms(axes, table)
+    axes.set_xticks([-1.0, -0.5, 0.0, 0.5, 1.0], ["-1", "-0.5", "0", "0.5", "1"])
+    axes.set_xlabel(r"$\cos\theta$")
+    axes.set_ylabel(r"$p_\theta$, density of $\cos\theta$")
+    axes.set_title(r"$p_\theta(\cos\theta)$")
+
+
+def _atoms(axes: Any, table: Table) -> None:
+    """Write the mass of each atom beside an arrow at its place."""
+    for column, at, side, aligned in ((0, -1.0, 1.0, "left"), (-1, 1.0, -1.0, "right")):
+        mass = float(table.p_theta[column])
+        if mass < 5e-6:
+            continue
+        axes.annotate(
+            "", (at, 0.98), (at, 0.55), ("data", "axes fraction"), ("data", "axes fraction"),
+            arrowprops={"arrowstyle": "-|>", "color": "tab:red", "linewidth": 1.6, "shrinkA": 0, "shrinkB": 0},
+            annotation_clip=False,
+        )  # fmt: skip
+        axes.annotate(
+            f"atom {100.0 * mass:.3g} %", (at, 0.95), (6.0 * side, 0.0), ("data", "axes fraction"), "offset points",
+            ha=aligned, va="top", color="tab:red",
+        )  # fmt: skip
+
+
+def _conditional(figure: Any, axes: Any, table: Table, name: str, label: str, ticks: dict[float, str] | None) -> None:
+    """One block as an image over cos theta."""
+    from matplotlib.colors import LogNorm
+
+    rows, masses = table.edges(name), table.block(name).astype(np.float64)
+    symbol = {"p_phi": r"\phi_\Delta", "p_r": "r", "p_z": "z", "p_l": "l"}[name]
+    title = rf"$p({symbol}\,|\,\theta)$"
+    if name == "p_l":
+        outside = float(masses[0] @ table.p_theta)  # a cell of zero width has no density
+        title += rf", {100.0 * outside:.3g} % never enters"
+        share = np.cumsum(masses @ table.p_theta)
+        last = int(np.searchsorted(share, SHOWN * share[-1])) + 1
+        rows, masses = rows[1 : last + 1], masses[1:last]
+    density = masses / np.diff(rows)[:, None]
+    # log colours from the most of what matters: a few cells at a rainbow do not set the scale
+    light = density[:, table.p_theta > 0.0]
+    top = float(np.quantile(light[light > 0.0], 0.995)) if (light > 0.0).any() else 1.0
+    norm = LogNorm(top / 10.0**DECADES, top)
+    columns = table.cos_theta_edges
+    axes.set_facecolor("black")
+    style = {"norm": norm, "cmap": "inferno", "rasterized": True, "linewidth": 0, "antialiased": False}
+    image = axes.pcolormesh(columns[1:-1], rows, _lit(density[:, 1:-1]), **style)
+    gap, width = STRIP
+    left, right = -1.0, 1.0
+    for column, at, side in ((0, -1.0, -1.0), (-1, 1.0, 1.0)):
+        if table.p_theta[column] < 5e-6:
+            continue
+        near, far = at + side * gap, at + side * (gap + width)
+        axes.axvspan(at, near, color="white", linewidth=0)
+        strip = sorted((near, far))
+        axes.pcolormesh(strip, rows, _lit(density[:, [column]]), **style)
+        left, right = min(left, far), max(right, far)
+    axes.set_xlim(left, right)
+    axes.set_ylim(rows[0], rows[-1])
+    if ticks is not None:
+        axes.set_yticks(list(ticks), list(ticks.values()))
+    marks = [-1.0, -0.5, 0.0, 0.5, 1.0]
+    names = [f"{mark:g}" for mark in marks]
+    if left < -1.0:
+        marks, names = [-1.0 - gap - 0.5 * width, *marks[1:]], ["atom", *names[1:]]
+    if right > 1.0:
+        marks, names = [*marks[:-1], 1.0 + gap + 0.5 * width], [*names[:-1], "atom"]
+    axes.set_xticks(marks, names)
+    axes.set_xlabel(r"$\cos\theta$")
+    axes.set_ylabel(label)
+    axes.set_title(title)
+    unit = "rad" if name == "p_phi" else "R"
+    figure.colorbar(image, ax=axes, label=f"density [1/{unit}]", pad=0.02, extend="both")
+
+
+def _lit(density: np.ndarray) -> np.ma.MaskedArray:
+    """Mask what holds no light: it stays black."""
+    return np.ma.masked_less_equal(density, 0.0)
+
+
+def _phase_function(axes: Any, table: Table) -> None:
+    """Fig. 8 of Zhou et al. 2003: P(theta), normalised to 4 pi, over the deflection in degrees."""
+    optics = table.header["optics"]
+    eta, fresnel = float(optics["eta"]), optics["fresnel"]
+    edges, density = _density(table)
+    degrees = np.degrees(np.arccos(edges))
+    published = abs(eta - ZHOU_ETA) < ROUNDING
+    theta = np.linspace(0.1, 179.9, 1799)
+    if eta != 1.0:
+        if published:
+            data = reference("gomsphere_n1333.csv")
+            name, column = {"sp": ("GOMsphere", "PN_fine"), "un": ("exact, averaged Fresnel", "P_un")}[fresnel]
+            axes.plot(data["theta_deg"], data[column], color="tab:blue", linewidth=1.2, label=name)
+        else:
+            exact = analytic.phase_function(np.radians(theta), eta, fresnel)
+            axes.plot(theta, exact, color="tab:blue", linewidth=1.2, label="exact geometrical optics")
+        low = analytic.phase_function(np.radians(theta), eta, fresnel, orders=2)
+        low = np.where(low > 0.0, low, np.nan)
+        axes.plot(theta, low, ":", color="black", linewidth=1.2, label="N = 2, orders 0 and 1")
+    if published:
+        circles = reference("zhou2003_fig8_montecarlo.csv")
+        style = {"markerfacecolor": "none", "markeredgecolor": "black", "markersize": 5.5, "zorder": 4}
+        label = "Monte Carlo (Kokhanovsky & Nakajima 1998)"
+        axes.plot(circles["theta_deg"], circles["P_MC_digitised"], "o", label=label, **style)
+    label = f"this table, {len(density)} cells"
+    _steps(axes, degrees[::-1], 2.0 * density[::-1], color="tab:red", linewidth=0.9, label=label)
+    axes.set_yscale("log")
+    axes.set_ylim(0.01, 100.0)
+    axes.set_xlim(0.0, 180.0)
+    axes.set_xticks(np.arange(0, 181, 20))
+    axes.set_ylabel(r"phase function $P(\theta)$")
+    axes.legend(frameon=False, loc="upper right")
+
+
+def _deviation(axes: Any, table: Table) -> None:
+    """How far each cell is from its exact mass."""
+    optics = table.header["optics"]
+    edges = table.cos_theta_edges
+    exact = analytic.deflection_masses(edges, optics["eta"], optics["fresnel"])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        percent = 100.0 * (table.p_theta / exact - 1.0)[1:-1]
+    degrees = np.degrees(np.arccos(edges[1:-1]))
+    axes.axhline(0.0, color="tab:blue", linewidth=1.2)
+    axes.stairs(percent[::-1], degrees[::-1], baseline=None, color="tab:red", linewidth=0.9)
+    finite = np.abs(percent[np.isfinite(percent)])
+    limit = min(max(1.1 * float(finite.max(initial=0.0)), 0.01), 100.0)
+    axes.set_ylim(-limit, limit)
+    axes.set_ylabel("table / exact − 1 [%]")
+    axes.set_xlabel(r"deflection $\theta$ [degrees]")
+
+
+def _fits(axes: Any, table: Table) -> None:
+    """p_theta, its stated error, and the lobes fitted to it."""
+    edges, density = _density(table)
+    error, stated = table.header["table_error"], table.header["fits"]
+    fine = np.cos(np.linspace(math.pi, 0.0, 2001))
+    middle = 0.5 * (fine[1:] + fine[:-1])
+    one, two = stated["henyey_greenstein"], stated["two_lobe"]
+    lobe = henyey_greenstein(one["g"], fine) / np.diff(fine)
+    lobes = two["weight"] * henyey_greenstein(two["g1"], fine)
+    lobes = (lobes + (1.0 - two["weight"]) * henyey_greenstein(two["g2"], fine)) / np.diff(fine)
+    spread = np.sqrt(table.p_theta)
+    # the stated noise, shared out among the columns as that of counts
+    scale = error["sampling_noise"] / (math.sqrt(0.5 / math.pi) * max(float(spread.sum()), 1e-300))
+    noise = scale * spread[1:-1] / np.diff(edges)
+    low = np.maximum(density - 2.0 * noise, 1e-12)
+    band = {"color": "tab:red", "alpha": 0.25, "linewidth": 0, "label": "±2 standard errors (stated noise)"}
+    axes.stairs(density + 2.0 * noise, edges, baseline=low, fill=True, **band)
+    _steps(axes, edges, density, color="tab:red", linewidth=1.0, label=f"this table, {len(density)} cells")
+    for values, name, style in (
+        (lobe, f"Henyey–Greenstein, g = {one['g']:.3f}, total variation {one['total_variation']:.2g}", "--"),
+        (lobes, f"two lobes, g = {two['g1']:.3f}, {two['g2']:.3f}, total variation {two['total_variation']:.2g}", "-"),
+    ):
+        axes.plot(middle, values, style, color="tab:blue", linewidth=1.1, label=name)
+    axes.set_yscale("log")
+    if (density > 0.0).any():
+        axes.set_ylim(max(density[density > 0.0].min(), density.max() * 1e-6) / 2.0, density.max() * 5.0)
+    axes.set_xlim(-1.0, 1.0)
+    _atoms(axes, table)
+    axes.set_xlabel(r"$\cos\theta$")
+    axes.set_ylabel(r"$p_\theta$, density of $\cos\theta$")
+    axes.legend(frameon=False, loc="upper left")
