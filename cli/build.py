@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-
 from tsdf.cli.common import Tool
+
 from tsdf.errors import TSDFError, UsageError
 
 if TYPE_CHECKING:
@@ -118,7 +118,9 @@ class Bar:
 )
 @click.option("--eta", type=float, help="Relative refractive index n_inside / n_outside.  [default: ice at 550 nm]")
 @click.option("--material", help="ice, water, quartz, salt, glass or sucrose, in air.")
-@click.option("--wavelength-nm", type=float, help=f"Wavelength for --material [nm].  [default: {DEFAULT_WAVELENGTH_NM:g}]")
+@click.option(
+    "--wavelength-nm", type=float, help=f"Wavelength for --material [nm].  [default: {DEFAULT_WAVELENGTH_NM:g}]"
+)
 @click.option(
     "--fresnel",
     type=click.Choice(["un", "sp"]),
@@ -133,11 +135,20 @@ class Bar:
 @click.option(
     "--joint", callback=_count, default="0", metavar="K", show_default=True, help="Joint records per cell of theta."
 )
-@click.option("--seed", callback=_count, default="0", metavar="N", show_default=True, help="Seed of the random numbers.")
 @click.option(
-    "--max-bounces", callback=_count, default="100000", metavar="N", show_default=True, help="Hits before a path is cut."
+    "--seed", callback=_count, default="0", metavar="N", show_default=True, help="Seed of the random numbers."
 )
-@click.option("--threads", callback=_count, metavar="N", help="Threads; the result does not depend on it.  [default: all]")
+@click.option(
+    "--max-bounces",
+    callback=_count,
+    default="100000",
+    metavar="N",
+    show_default=True,
+    help="Hits before a path is cut.",
+)
+@click.option(
+    "--threads", callback=_count, metavar="N", help="Threads; the result does not depend on it.  [default: all]"
+)
 @click.option("--repair", is_flag=True, help="Try to close an open mesh, and say what that changed.")
 @click.option("--chunk", "part", callback=_part, metavar="i/n", help="Trace part i of n only; --out is for tsdf-merge.")
 @click.option("--resume", is_flag=True, help="Go on with an interrupted build of the same command.")
@@ -242,7 +253,11 @@ def _run(build: "Build", shape: Any, threads: int, part: tuple[int, int] | None,
         build.run(shape, threads, part or (1, 1), part_file, bar)
     except KeyboardInterrupt as interrupt:
         bar.close()
-        safe = f"{build.paths} paths are safe in {part_file}; go on with --resume" if part_file.exists() else "nothing done yet"
+        safe = (
+            f"{build.paths} paths are safe in {part_file}; go on with --resume"
+            if part_file.exists()
+            else "nothing done yet"
+        )
         click.echo(f"interrupted: {safe}", err=True)
         raise SystemExit(128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)) from None
     finally:

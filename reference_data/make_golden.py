@@ -98,12 +98,7 @@ def table(
             "first_row": sum(len(above) for above in pixels),
             "rows": len(block),
         }
-        field = (
-            name.removeprefix("joint_")
-            .removeprefix("p_")
-            .replace("phi_delta", "phi")
-            .replace("phi", "phi_delta")
-        )
+        field = name.removeprefix("joint_").removeprefix("p_").replace("phi_delta", "phi").replace("phi", "phi_delta")
         if name == "mean_l":
             entry |= {"kind": "mean", "of": "p_l", "unit": "R"}
         elif name.startswith("joint_"):
@@ -231,9 +226,7 @@ def attributes(text: bytes, width: int, height: int) -> Attributes:
     }
 
 
-def bind(
-    attributes: Attributes, chunks: list[bytes], seal: bool = True, tail: bytes = b"", shift: int = 0
-) -> bytes:
+def bind(attributes: Attributes, chunks: list[bytes], seal: bool = True, tail: bytes = b"", shift: int = 0) -> bytes:
     """Return the bytes of a file, its digest filled in if `seal`."""
     head = bytes.fromhex("762f3101 02000000")
     at = 0
@@ -328,9 +321,7 @@ def invalid() -> dict[str, bytes]:
     made["EXR_ATTRIBUTE-twice"] = twice
     container("EXR_ATTRIBUTE-aspect", {"pixelAspectRatio": ("float", struct.pack("<f", 2.0))})
     container("EXR_ATTRIBUTE-long_name", {"n" * 40: ("int", bytes(4))})
-    made["EXR_ATTRIBUTE-claims_4_GB"] = good.replace(
-        b"type\0string\0\x0d\0\0\0", b"type\0string\0\xff\xff\xff\xff"
-    )
+    made["EXR_ATTRIBUTE-claims_4_GB"] = good.replace(b"type\0string\0\x0d\0\0\0", b"type\0string\0\xff\xff\xff\xff")
     container("EXR_NOT_TSDF", {"tsdf": None})
     container("EXR_CHANNEL-half", {"channels": ("chlist", half)})
     container("EXR_CHANNEL-two", {"channels": ("chlist", two)})
@@ -340,9 +331,7 @@ def invalid() -> dict[str, bytes]:
     moved = window(4, 0, width + 3, height - 1)
     container("EXR_WINDOW-origin", {"dataWindow": moved, "displayWindow": moved})
     huge = window(0, 0, 2**31 - 1, 2**31 - 1)
-    container(
-        "EXR_WINDOW-overflow", {"dataWindow": window(0, 0, -1, -1), "displayWindow": window(0, 0, -1, -1)}
-    )
+    container("EXR_WINDOW-overflow", {"dataWindow": window(0, 0, -1, -1), "displayWindow": window(0, 0, -1, -1)})
     container("EXR_SIZE", {"dataWindow": huge, "displayWindow": huge})
     container("EXR_CHUNK-offset", {}, shift=1)
     container("EXR_CHUNK-line", {}, parts=[struct.pack("<i", 16) + parts[0][4:]])

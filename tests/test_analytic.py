@@ -280,9 +280,7 @@ def test_absorption_may_come_after_the_trace(eta):
     assert spread == pytest.approx(deflection_masses(CELLS, eta, absorption=absorption), abs=2e-8)
 
 
-@pytest.mark.parametrize(
-    "eta, absorption, tolerance", [(1.33, 0.0, 1e-8), (1.33, 0.2, 1e-10), (0.75, 0.0, 2e-8)]
-)
+@pytest.mark.parametrize("eta, absorption, tolerance", [(1.33, 0.0, 1e-8), (1.33, 0.2, 1e-10), (0.75, 0.0, 2e-8)])
 def test_phase_function_integrates_to_masses(eta, absorption, tolerance):
     """Cells cut at every rainbow, and a substitution that flattens the infinities at the cuts.
 

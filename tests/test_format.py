@@ -101,9 +101,7 @@ def test_the_set_of_codes_is_closed() -> None:
     listed = re.findall(r"^\| `([A-Z_]+)` \| (\w+) \| (.*) \|$", SPEC, flags=re.M)
     assert {code: (severity, rule) for code, severity, rule in listed} == fmt.CODES
     used = set(
-        re.findall(
-            r'"((?:FILE|EXR|HEADER|VERSION|HASH|MANIFEST|VALUE)_[A-Z_]+)"', Path(fmt.__file__).read_text()
-        )
+        re.findall(r'"((?:FILE|EXR|HEADER|VERSION|HASH|MANIFEST|VALUE)_[A-Z_]+)"', Path(fmt.__file__).read_text())
     )
     assert used == set(fmt.CODES)
 

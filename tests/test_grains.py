@@ -30,9 +30,7 @@ def mesh(name="cube", **given):
 def joined(*parts):
     """Concatenate meshes into one."""
     starts = np.cumsum([0] + [len(v) for v, _ in parts[:-1]])
-    return np.vstack([v for v, _ in parts]), np.vstack(
-        [f + s for (_, f), s in zip(parts, starts, strict=True)]
-    )
+    return np.vstack([v for v, _ in parts]), np.vstack([f + s for (_, f), s in zip(parts, starts, strict=True)])
 
 
 def moved(part, scale=1.0, shift=(0, 0, 0)):
@@ -603,7 +601,5 @@ def test_repair_drops_sheets_and_gives_up_on_nonsense():
     sheet = (np.array([[5.0, 0, 0], [6, 0, 0], [5, 1, 0]]), np.array([[0, 1, 2]]))
     refused("boundary edges", *joined(mesh(), sheet))
     grain = grain_from_mesh(*joined(mesh(), sheet), repair=True)
-    assert grain.mesh_hash == load_grain("cube").mesh_hash and any(
-        "dropped 1 shell" in n for n in grain.notes
-    )
+    assert grain.mesh_hash == load_grain("cube").mesh_hash and any("dropped 1 shell" in n for n in grain.notes)
     refused("cannot be closed|no volume|edges", *sheet, repair=True)

@@ -128,8 +128,8 @@ def test_a_newer_minor_version_is_a_warning_of_the_structure():
         {"name": "hexprism", "eta": 1.31},
         {"name": "hexprism", "eta": 0.8},
         {"name": "tetrahedron", "eta": 1.31, "cells": 128, "paths": 1 << 12},
-        {"name": "snow", "eta": 1.31},
-        {"name": "snow", "eta": 1.0},
+        {"name": "snow", "eta": 1.31, "paths": 1 << 13},
+        {"name": "cube", "eta": 1.0},
     ],
     ids=str,
 )

@@ -321,10 +321,7 @@ def _moments(eta: float, apart: bool, absorption: float) -> _Moments:
     # P_n(cos x) = sum_k a_k a_(n-k) cos((n - 2k) x), a_k = (2k)!/(2^k k!)^2
     a = np.cumprod([1.0] + [(2 * k - 1) / (2 * k) for k in range(1, LEGENDRE_ORDERS)])
     legendre = np.array(
-        [
-            sum(a[k] * a[n - k] * harmonics[abs(n - 2 * k)] for k in range(n + 1))
-            for n in range(LEGENDRE_ORDERS)
-        ]
+        [sum(a[k] * a[n - k] * harmonics[abs(n - 2 * k)] for k in range(n + 1)) for n in range(LEGENDRE_ORDERS)]
     )
     if eta < 1:  # b > eta: all is reflected, and cos_theta = 2 b^2 - 1
         gap = 1 - eta * eta
@@ -496,9 +493,7 @@ def _spread(weight: Array, start: Array, stop: Array, cosines: Array) -> Array:
     return mass
 
 
-def deflection_masses(
-    cos_theta_edges: ArrayLike, eta: float, fresnel: str = "un", absorption: float = 0.0
-) -> Array:
+def deflection_masses(cos_theta_edges: ArrayLike, eta: float, fresnel: str = "un", absorption: float = 0.0) -> Array:
     """Probability that light which leaves the sphere does so in each cell of cos_theta.
 
     Parameters
@@ -668,9 +663,7 @@ def _events(
     return out, count, residual
 
 
-def _list_events(
-    eta: float, apart: bool, absorption: float, intervals: int, first: int = 0
-) -> tuple[Array, float]:
+def _list_events(eta: float, apart: bool, absorption: float, intervals: int, first: int = 0) -> tuple[Array, float]:
     """`_events` with the floor that leaves out at most 5e-10 of the energy."""
     edges = np.linspace(0, np.pi / 2, intervals + 1)
     middle = (edges[1:] + edges[:-1]) / 2
@@ -806,9 +799,7 @@ def convex_theorems(area: float, volume: float, bounding_radius: float = 1.0) ->
     _measures(area, volume, bounding_radius)
     beta = area / (4 * np.pi * bounding_radius**2)
     if beta > 1 + 1e-9 or 36 * np.pi * volume**2 > area**3 * (1 + 1e-9):
-        raise UsageError(
-            f"no convex grain has area {area:g} and volume {volume:g} within radius {bounding_radius:g}"
-        )
+        raise UsageError(f"no convex grain has area {area:g} and volume {volume:g} within radius {bounding_radius:g}")
     return ConvexTheorems(float(min(beta, 1.0)), 4 * volume / area, 4 * bounding_radius / 3)
 
 

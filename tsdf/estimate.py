@@ -11,11 +11,9 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
-from numba import njit
 
-from tsdf import analytic
 from tsdf import tally as T
-from tsdf.errors import TSDFError, UsageError
+from tsdf.errors import TSDFError
 from tsdf.optics import Optics
 from tsdf.table import CONDITIONALS, FORMAT_VERSION, RECORD_FIELDS, Table
 from tsdf.tally import Tally
@@ -34,7 +32,6 @@ STATISTICS = (
     "atom_backward",
 )
 LICENCE = "CC0-1.0"
-LEDGER_UNITS = 1 << 52  # energy units of an exact table
 
 
 @dataclass(frozen=True)
@@ -180,7 +177,7 @@ def legendre_matrix(edges: np.ndarray) -> np.ndarray:
     return means
 
 
-def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.divide(a, b, out=np.zeros(np.broadcast(a, b).shape), where=b != 0)
 
 
@@ -191,10 +188,10 @@ def _scalar_statistics(sums: np.ndarray) -> np.ndarray:
     missed = sums[..., T.UNSCATTERED]
     means = [
         1.0 - missed / launched,
-        _ratio(scattered, launched - missed),
-        *(_ratio(sums[..., i], scattered) for i in (T.COS_THETA, T.MEAN_Z, T.MEAN_R)),
-        _ratio(sums[..., T.MISS_CHORD], missed),
-        *(_ratio(sums[..., i], scattered) for i in (T.PATH_LENGTH, -2, -1, T.OFFSET)),
+        ratio(scattered, launched - missed),
+        *(ratio(sums[..., i], scattered) for i in (T.COS_THETA, T.MEAN_Z, T.MEAN_R)),
+        ratio(sums[..., T.MISS_CHORD], missed),
+        *(ratio(sums[..., i], scattered) for i in (T.PATH_LENGTH, -2, -1, T.OFFSET)),
     ]
     return np.stack(means, axis=-1)
 
@@ -242,7 +239,7 @@ def _joint_variation(energy: np.ndarray) -> float:
     """Return the total variation between (groups, phi, r, z) and the product of its marginals given the group."""
     p = energy / energy.sum()
     group = p.sum(axis=(1, 2, 3), keepdims=True)
-    given = _ratio(p, group)
+    given = ratio(p, group)
     product = given.sum(axis=(2, 3), keepdims=True) * given.sum(axis=(1, 3), keepdims=True)
     product = product * given.sum(axis=(1, 2), keepdims=True)
     return float(0.5 * (group * np.abs(given - product)).sum())
@@ -329,10 +326,12 @@ def fits(p_theta: np.ndarray, edges: np.ndarray, mean_cosine: float) -> dict[str
     }
 
 
-def _systematic(weights: np.ndarray, count: int) -> np.ndarray:
+def systematic(weights: np.ndarray, count: int) -> np.ndarray:
     """Return `count` indices in proportion to `weights`, evenly spaced in the running sum."""
     running = np.cumsum(weights)
-    return np.searchsorted(running, (np.arange(count) + 0.5) / count * running[-1], side="right").clip(0, len(weights) - 1)
+    return np.searchsorted(running, (np.arange(count) + 0.5) / count * running[-1], side="right").clip(
+        0, len(weights) - 1
+    )
 
 
 def records_of(tally: Tally, cells: int) -> np.ndarray:
@@ -357,7 +356,7 @@ def records_of(tally: Tally, cells: int) -> np.ndarray:
             rows = rows[np.lexsort(rows[:, 2:].T[::-1][[1, 0, 2, 3, 4, 5]])]
         else:
             rows = rows[np.lexsort(rows[:, 2:].T[::-1][[1, 0, 2, 3, 4, 5]])]
-            rows = rows[_systematic(rows[:, 1], count)]
+            rows = rows[systematic(rows[:, 1], count)]
         rows = rows[np.argsort(rows[:, 6], kind="stable")]
         result[:, :, column] = rows[:, 2:].T
     result[2] = np.where(result[2] <= -math.pi, math.pi, result[2])
@@ -365,10 +364,10 @@ def records_of(tally: Tally, cells: int) -> np.ndarray:
     return result
 
 
-def _normalised(energy: np.ndarray) -> np.ndarray:
+def normalised(energy: np.ndarray) -> np.ndarray:
     """Return (rows, columns) masses that sum to 1 in each column that holds anything, from (columns, rows) energy."""
     energy = energy.T.astype(np.float64)
-    return _ratio(energy, energy.sum(axis=0, keepdims=True))
+    return ratio(energy, energy.sum(axis=0, keepdims=True))
 
 
 def software() -> str:
@@ -379,7 +378,7 @@ def software() -> str:
         return "tsdf-toolkit"
 
 
-def _assemble(
+def assemble(
     *,
     grain: Mapping[str, Any],
     optics: Optics,
@@ -464,8 +463,10 @@ def traced_table(
     values, errors = jackknife(sums, _scalar_statistics)
     fine_edges = np.concatenate(([-1.0], np.cos(np.linspace(math.pi, 0.0, T.FINE + 1)), [1.0]))
     matrix = legendre_matrix(fine_edges)
-    fine = np.concatenate((tally.theta[:, T.FINE + 1 :], tally.theta[:, T.FINE - 1 :: -1], tally.theta[:, T.FINE : T.FINE + 1]), axis=1)
-    moments, moment_errors = jackknife(fine, lambda energy: _ratio(energy @ matrix, energy.sum(axis=-1, keepdims=True)))
+    fine = np.concatenate(
+        (tally.theta[:, T.FINE + 1 :], tally.theta[:, T.FINE - 1 :: -1], tally.theta[:, T.FINE : T.FINE + 1]), axis=1
+    )
+    moments, moment_errors = jackknife(fine, lambda energy: ratio(energy @ matrix, energy.sum(axis=-1, keepdims=True)))
     statistics: dict[str, Any] = dict(zip(STATISTICS, values[:-1].tolist(), strict=True))
     standard_errors: dict[str, Any] = dict(zip(STATISTICS, errors[:-1].tolist(), strict=True))
     moments[:2], moment_errors[:2] = (1.0, statistics["mean_cosine"]), (0.0, standard_errors["mean_cosine"])
@@ -473,18 +474,19 @@ def traced_table(
 
     energy = columns_of(tally.theta.sum(axis=0), cells)
     columns = {
-        name: columns_of(np.ascontiguousarray(tally.conditional(name).T), cells).T for name in ("phi", "r", "z", "l", "l_sum")
+        name: columns_of(np.ascontiguousarray(tally.conditional(name).T), cells).T
+        for name in ("phi", "r", "z", "l", "l_sum")
     }
     totals = dict(zip(T.SCALARS, (int(v) for v in tally.scalars.astype(object).sum(axis=0)), strict=True))
     ledger = {name: totals[name] for name in ("launched", "unscattered", "scattered")}
     ledger |= {"absorbed": 0, "truncated": totals["truncated"], "lost": totals["lost"]}
-    return _assemble(
+    return assemble(
         grain=grain,
         optics=optics,
         edges=cos_theta_edges(cells),
         p_theta=energy / energy.sum(),
-        conditionals={f"p_{name}": _normalised(columns[name]) for name in ("phi", "r", "z", "l")},
-        mean_l=_ratio(columns["l_sum"].astype(np.float64), columns["l"].astype(np.float64)).T,
+        conditionals={f"p_{name}": normalised(columns[name]) for name in ("phi", "r", "z", "l")},
+        mean_l=ratio(columns["l_sum"].astype(np.float64), columns["l"].astype(np.float64)).T,
         joint=records_of(tally, cells) if tally.joint else None,
         statistics=statistics,
         standard_errors=standard_errors,
@@ -492,188 +494,5 @@ def traced_table(
         factorisation=Factorisation(tally.box, tally.box_l),
         mean_offset=float(values[-1]),
         ledger=ledger,
-        provenance=provenance,
-    )
-
-
-@njit(cache=True)
-def _covered(a, b, low, high):  # type: ignore[no-untyped-def]
-    """Return the share of the interval a .. b that lies in low .. high; a point lies in one of them or the next."""
-    if b <= a:
-        return 1.0 if low <= a < high or a == high == 1.0 else 0.0
-    return max(0.0, (min(b, high) - max(a, low)) / (b - a))
-
-
-@njit(cache=True)
-def _deposit(weight, low, high, row, edges, out):  # type: ignore[no-untyped-def]
-    """Spread each event's weight over the columns it covers, as far as it covers each: out[column, row] += share."""
-    columns = len(edges) - 1
-    for k in range(len(weight)):
-        a, b = min(low[k], high[k]), max(low[k], high[k])
-        i = min(max(np.searchsorted(edges, a, side="right") - 1, 0), columns - 1)
-        while i < columns and edges[i] <= b:
-            out[i, row[k]] += weight[k] * _covered(a, b, edges[i], edges[i + 1])
-            i += 1
-
-
-@njit(cache=True)
-def _choose(weight, low, high, edges, totals, chosen):  # type: ignore[no-untyped-def]
-    """Write the events at evenly spaced places of each column's running sum, (columns, records), in their order."""
-    columns, count = chosen.shape
-    running, taken = np.zeros(columns), np.zeros(columns, dtype=np.int64)
-    for k in range(len(weight)):
-        a, b = min(low[k], high[k]), max(low[k], high[k])
-        i = min(max(np.searchsorted(edges, a, side="right") - 1, 0), columns - 1)
-        while i < columns and edges[i] <= b:
-            running[i] += weight[k] * _covered(a, b, edges[i], edges[i + 1])
-            while taken[i] < count and running[i] > (taken[i] + 0.5) / count * totals[i]:
-                chosen[i, taken[i]] = k
-                taken[i] += 1
-            i += 1
-    for i in range(columns):  # rounding may leave the last places open
-        for j in range(taken[i], count):
-            chosen[i, j] = chosen[i, taken[i] - 1] if taken[i] > 0 else 0
-
-
-def _exact_width(optics: Optics, cells: int) -> float:
-    """Return the total variation between the exact p_theta and its cell means."""
-    parts = 16
-    edges = cos_theta_edges(cells)[1:-1]
-    theta = np.arccos(edges)
-    fine = np.cos((theta[:-1, None] + np.diff(theta)[:, None] * np.arange(parts) / parts).ravel())
-    fine = np.append(fine, 1.0)
-    masses = analytic.deflection_masses(fine, optics.eta, optics.fresnel).reshape(cells, parts)
-    share = np.diff(fine).reshape(cells, parts)
-    share /= share.sum(axis=1, keepdims=True)
-    return float(0.5 * np.abs(masses - masses.sum(axis=1, keepdims=True) * share).sum())
-
-
-def exact_table(
-    cells: int | None,
-    target: float | None,
-    joint: int,
-    grain: Mapping[str, Any],
-    optics: Optics,
-    provenance: Mapping[str, Any],
-) -> Table:
-    """Return the table of the exact sphere by quadrature over the impact parameter, without random numbers.
-
-    Parameters
-    ----------
-    cells : int, optional
-        Cells of theta; by default the fewest that meet `target`.
-    target : float, optional
-        Total variation of p_theta that the cells may cost.
-    joint : int
-        Records per column, 0 for none.
-    """
-    if cells is None:
-        assert target is not None
-        cells = next((n for n in candidate_cells() if _exact_width(optics, n) <= target), None)
-        if cells is None:
-            raise UsageError(
-                f"--target-error {target:g} is out of reach: {MAX_CELLS} cells of theta, the most a table may have, "
-                f"cost {_exact_width(optics, MAX_CELLS):.2g} of total variation"
-            )
-    elif target is not None and _exact_width(optics, cells) > target:
-        raise UsageError(f"--target-error {target:g} needs more than {cells} cells, which cost {_exact_width(optics, cells):.2g}")
-    edges = cos_theta_edges(cells)
-    inner = edges[1:-1]
-    truth = analytic.sphere_statistics(optics.eta, optics.fresnel)
-    p_theta = np.concatenate(
-        ([truth.atom_backward], analytic.deflection_masses(inner, optics.eta, optics.fresnel), [truth.atom_forward])
-    )
-    atoms = truth.atom_forward + truth.atom_backward
-    p_theta[1:-1] *= 1.0 - atoms
-    events = analytic.sphere_events(optics.eta, optics.fresnel, intervals=16384)
-    low, high, weight = events.cos_theta_from, events.cos_theta_to, events.weight
-
-    def spread(row: np.ndarray, count: int, scale: np.ndarray | float = 1.0, by: np.ndarray = inner) -> np.ndarray:
-        out = np.zeros((len(by) - 1, count))
-        _deposit(weight * scale, low, high, row.astype(np.int64), by, out)
-        return out
-
-    def cell(values: np.ndarray, axis: np.ndarray) -> np.ndarray:
-        return np.clip(np.searchsorted(axis, values, side="right") - 1, 0, len(axis) - 2)
-
-    def with_atoms(inside: np.ndarray) -> np.ndarray:
-        """Add the atom columns: empty ones, or all the light of a sphere that does not deflect."""
-        edge = np.zeros((1, inside.shape[1]))
-        if atoms:
-            return np.concatenate((edge, np.zeros_like(inside), inside.sum(axis=0, keepdims=True)))
-        return np.concatenate((edge, inside, edge))
-
-    phi = cell(np.where(events.phi_delta < T.PHI_EDGES[0], events.phi_delta + 2.0 * math.pi, events.phi_delta), T.PHI_EDGES)
-    r, z, length = cell(events.r, T.R_EDGES), cell(events.z, T.Z_EDGES), cell(events.path_length, T.L_EDGES)
-    energy = {
-        "p_phi": with_atoms(spread(phi, T.PHI)),
-        "p_r": with_atoms(spread(r, T.R)),
-        "p_z": with_atoms(spread(z, T.Z)),
-        "p_l": with_atoms(spread(length, T.L)),
-    }
-    moments = with_atoms(spread(length, T.L, events.path_length))
-    dark = p_theta <= 0.0
-    conditionals = {name: np.where(dark, 0.0, _normalised(values)) for name, values in energy.items()}
-    mean_l = np.where(dark, 0.0, _ratio(moments, energy["p_l"]).T)
-
-    groups = np.cos(np.linspace(math.pi, 0.0, T.GROUPS + 1))
-    groups[0], groups[-1] = -1.0, 1.0
-    turned = np.where(events.phi_delta > 0.5 * math.pi, T.BOX["phi"] // 2, 0)
-    r_box, z_box = r * T.BOX["r"] // T.R, z * T.BOX["z"] // T.Z
-    l_box = np.minimum((events.path_length * (T.BOX["l"] / T.BOX_LENGTH)).astype(np.int64), T.BOX["l"] - 1)
-    shape = tuple(T.BOX[name] for name in ("phi", "r", "z"))
-    box = spread(np.ravel_multi_index((turned, r_box, z_box), shape), math.prod(shape), by=groups)
-    width = sum(shape)
-    box_l = np.zeros((T.GROUPS, T.BOX["l"] * width))
-    for place in (turned, shape[0] + r_box, shape[0] + shape[1] + z_box):
-        box_l += spread(l_box * width + place, T.BOX["l"] * width, by=groups)
-
-    records = None
-    if joint:
-        records = np.zeros((len(RECORD_FIELDS), joint, cells + 2))
-        fields = np.stack([
-            events.r, events.z, events.phi_delta, events.path_length, events.entry_b2, events.entry_azimuth
-        ])  # fmt: skip
-        order = np.argsort(events.entry_b2, kind="stable")
-        totals = np.zeros((cells, 1))
-        arguments = (weight[order], low[order], high[order])
-        _deposit(*arguments, np.zeros(len(order), np.int64), inner, totals)
-        chosen = np.zeros((cells, joint), dtype=np.int64)
-        _choose(*arguments, inner, totals[:, 0], chosen)
-        if atoms:
-            records[:, :, -1] = fields[:, order[_systematic(weight[order], joint)]]
-        else:
-            records[:, :, 1:-1] = fields[:, order[chosen.T]]
-        records[:, :, dark] = 0.0
-
-    offset = np.hypot(events.r, events.z)
-    statistics: dict[str, Any] = {
-        "hit_probability": 1.0,
-        "albedo": 1.0,
-        "mean_cosine": truth.mean_cosine,
-        "mean_z": truth.mean_z,
-        "mean_r": truth.mean_r,
-        "mean_miss_chord": 0.0,
-        "mean_path_length": truth.mean_path_length,
-        "atom_forward": truth.atom_forward,
-        "atom_backward": truth.atom_backward,
-        "legendre_moments": [float(v) for v in truth.legendre[: LEGENDRE + 1]],
-    }
-    # p_theta and the statistics hold all orders; only the conditionals lack events.residual (< 1e-9)
-    ledger = {"launched": LEDGER_UNITS, "unscattered": 0, "scattered": LEDGER_UNITS}
-    return _assemble(
-        grain=grain,
-        optics=optics,
-        edges=edges,
-        p_theta=p_theta,
-        conditionals=conditionals,
-        mean_l=mean_l,
-        joint=records,
-        statistics=statistics,
-        standard_errors={name: 0.0 for name in STATISTICS} | {"legendre_moments": [0.0] * (LEGENDRE + 1)},
-        error=TableError(cells, 0.0, 0.0 if atoms else _exact_width(optics, cells)),
-        factorisation=Factorisation(box.reshape((1, T.GROUPS, *shape)), box_l.reshape((1, T.GROUPS, T.BOX["l"], width))),
-        mean_offset=float((weight * offset).sum() / weight.sum()),
-        ledger=ledger | {"absorbed": 0, "truncated": 0, "lost": 0},
         provenance=provenance,
     )

@@ -179,9 +179,7 @@ def _rounded_maximum(values: Floats, radius: Floats | float) -> Floats:
     Where one value stands out by more than the radius k it is exactly that value.
     """
     top = values.max(axis=0)
-    s = (
-        top - radius
-    )  # the sum is at least k² here and falls as s grows: Newton's steps go up and never pass the root
+    s = top - radius  # the sum is at least k² here and falls as s grows: Newton's steps go up and never pass the root
     for _ in range(30):
         excess = np.maximum(0, values - s)
         s = s + ((excess**2).sum(axis=0) - np.square(radius)) / (2 * excess.sum(axis=0))
@@ -223,9 +221,7 @@ def snow(lobes: int, rounding: float, seed: int, subdivisions: int) -> Mesh:
     warmth = 1 / (1 + np.exp(-5 * (u @ turned()[0])))  # 1 on the side that melted
     radius = 0.08 + rounding * (0.2 * rounding + 0.4 * warmth)
     corners = np.array([[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]])[:lobes] @ turned()
-    away = (
-        corners - corners.mean(axis=0) + rng.normal(0, 0.25, (lobes, 3))
-    )  # lobes lie apart: a simplex, jittered
+    away = corners - corners.mean(axis=0) + rng.normal(0, 0.25, (lobes, 3))  # lobes lie apart: a simplex, jittered
     radii = []
     for k in range(lobes):
         offset = rng.uniform(0.35, 0.6) * away[k] / np.linalg.norm(away[k]) * (lobes > 1)
@@ -243,11 +239,7 @@ EXEMPLARS: dict[str, Exemplar] = {
     "cube": Exemplar(
         "cube, sharp or bevelled",
         cube,
-        {
-            "bevel": Parameter(
-                0.0, 0.0, 0.49, "of the edge", "width cut off each face along each edge, at 45 degrees"
-            )
-        },
+        {"bevel": Parameter(0.0, 0.0, 0.49, "of the edge", "width cut off each face along each edge, at 45 degrees")},
     ),
     "octahedron": Exemplar("regular octahedron", octahedron, {}),
     "tetrahedron": Exemplar("regular tetrahedron", tetrahedron, {}),

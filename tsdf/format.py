@@ -382,9 +382,7 @@ def _header(attribute: Attribute) -> dict[str, Any]:
             depth += 1
             if depth > MAX_DEPTH:
                 raise too_deep
-            level = [
-                item for value in level for item in (value.values() if isinstance(value, dict) else value)
-            ]
+            level = [item for value in level for item in (value.values() if isinstance(value, dict) else value)]
         json.dumps(header, ensure_ascii=False).encode()  # refuses half a surrogate pair
     except RecursionError:
         raise too_deep from None

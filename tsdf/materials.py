@@ -146,9 +146,7 @@ MEDIA = {
         None,
         "Ghosh 1999, doi:10.1016/S0030-4018(99)00091-7, ordinary ray; birefringence ignored",
     ),
-    "salt": Medium(
-        (200.0, 30000.0), sellmeier_n(SALT_TERMS), None, "NaCl, Li 1976, doi:10.1063/1.555536, 297 K"
-    ),
+    "salt": Medium((200.0, 30000.0), sellmeier_n(SALT_TERMS), None, "NaCl, Li 1976, doi:10.1063/1.555536, 297 K"),
     "glass": Medium(
         (300.0, 2500.0),
         sellmeier_n(GLASS_TERMS),

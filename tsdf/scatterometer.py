@@ -21,6 +21,7 @@ import numpy as np
 from tsdf import estimate
 from tsdf import tally as T
 from tsdf.errors import GrainError, TSDFError, UsageError
+from tsdf.exact import exact_table
 from tsdf.grains import Grain
 from tsdf.optics import Optics
 from tsdf.table import Table
@@ -72,15 +73,17 @@ class Effort:
     def __post_init__(self) -> None:
         if self.paths is not None and not (MIN_PATHS <= self.paths <= MAX_PATHS):
             raise UsageError(
-                f"the number of paths must be {MIN_PATHS} to {MAX_PATHS:.2g}, got {self.paths:.6g}: errors are told from "
-                f"{T.REPLICATES} independent samples, and counts must stay exact"
+                f"the number of paths must be {MIN_PATHS} to {MAX_PATHS:.2g}, got {self.paths:.6g}: errors are told "
+                f"from {T.REPLICATES} independent samples, and counts must stay exact"
             )
         if self.target_error is not None and not (0.0 < self.target_error < 1.0):
             raise UsageError(f"the target error is a total variation between 0 and 1, got {self.target_error:g}")
         if self.paths is not None and self.target_error is not None:
             raise UsageError("give a number of paths or a target error, not both")
         if self.cells is not None and not (estimate.MIN_CELLS <= self.cells <= estimate.MAX_CELLS):
-            raise UsageError(f"the cells of theta must be {estimate.MIN_CELLS} to {estimate.MAX_CELLS}, got {self.cells}")
+            raise UsageError(
+                f"the cells of theta must be {estimate.MIN_CELLS} to {estimate.MAX_CELLS}, got {self.cells}"
+            )
         if not (0 <= self.joint <= MAX_JOINT):
             raise UsageError(f"the joint records per cell must be 0 to {MAX_JOINT}, got {self.joint}")
         if not (0 <= self.seed < 1 << 63):
@@ -161,7 +164,7 @@ def exact_sphere(grain: Grain, optics: Optics, effort: Effort) -> Table:
         "paths": 0,
         "max_bounces": None,
     }
-    return estimate.exact_table(cells, effort.target_error, effort.joint, header, optics, provenance)
+    return exact_table(cells, effort.target_error, effort.joint, header, optics, provenance)
 
 
 @dataclass
@@ -260,7 +263,8 @@ class Build:
         if finest.cell_width > 1.5 * target and finest.sampling_noise < 0.5 * target:
             raise UsageError(
                 f"--target-error {target:g} is out of reach: {finest.cells} cells of theta alone cost "
-                f"{finest.cell_width:.2g} of total variation; " + ("allow more --cells" if self.effort.cells else "ask for more")
+                f"{finest.cell_width:.2g} of total variation; "
+                + ("allow more --cells" if self.effort.cells else "ask for more")
             )
         return False
 
@@ -292,8 +296,14 @@ class Build:
             If the grain loses more than MAX_LEAK of the light, told once enough paths are done to be sure.
         """
         tracers = [
-            Tracer(grain, self.optics.eta, self.optics.fresnel, self.effort.seed, self.effort.max_bounces,
-                   reflectance_scale=reflectance_scale)  # fmt: skip
+            Tracer(
+                grain,
+                self.optics.eta,
+                self.optics.fresnel,
+                self.effort.seed,
+                self.effort.max_bounces,
+                reflectance_scale=reflectance_scale,
+            )
             for _ in range(threads)
         ]
         tallies = [Tally(joint=self.effort.joint) for _ in range(threads)]
@@ -336,7 +346,9 @@ class Build:
                 stop.set()
                 raise
         if self.effort.target_error is not None:
-            raise TSDFError(f"--target-error {self.effort.target_error:g} was not met after {MAX_PATHS:.2g} paths: ask for more")
+            raise TSDFError(
+                f"--target-error {self.effort.target_error:g} was not met after {MAX_PATHS:.2g} paths: ask for more"
+            )
 
     def _shown_error(self, progress: Progress) -> float | None:
         error = self.error() if self.done else None
@@ -377,7 +389,9 @@ class Build:
         if self.effort.paths is not None:
             missing = [k for k, _ in enumerate(chunks(self.effort.paths)) if k not in self.done]
             if missing:
-                raise TSDFError(f"{len(missing)} of {len(missing) + len(self.done)} chunks are missing: give all the parts")
+                raise TSDFError(
+                    f"{len(missing)} of {len(missing) + len(self.done)} chunks are missing: give all the parts"
+                )
         self.check_leaks()
         cells = self.effort.cells
         if cells is None:
@@ -403,7 +417,12 @@ class Build:
         """
         buffer = io.BytesIO()
         request = np.frombuffer(json.dumps(self.request).encode(), dtype=np.uint8)
-        np.savez(buffer, request=request, done=np.array(sorted(self.done), dtype=np.int64), **self.tally.arrays())
+        arrays: dict[str, Any] = {
+            "request": request,
+            "done": np.array(sorted(self.done), dtype=np.int64),
+            **self.tally.arrays(),
+        }
+        np.savez(buffer, **arrays)
         write_atomically(path, buffer.getvalue())
 
     @classmethod
@@ -437,7 +456,9 @@ class Build:
         except TSDFError:
             raise
         except Exception as error:  # whatever zip, npy and json readers make of a damaged file
-            raise TSDFError(f"{path}: not a usable part file ({type(error).__name__}): delete it and build again") from None
+            raise TSDFError(
+                f"{path}: not a usable part file ({type(error).__name__}): delete it and build again"
+            ) from None
         return build
 
 

@@ -70,7 +70,9 @@ class Table:
         for block in self.header["blocks"]:
             if block["name"] == name:
                 return block
-        raise UsageError(f"the table has no block {name!r}; it has {', '.join(b['name'] for b in self.header['blocks'])}")
+        raise UsageError(
+            f"the table has no block {name!r}; it has {', '.join(b['name'] for b in self.header['blocks'])}"
+        )
 
     def block(self, name: str) -> np.ndarray:
         """Return the rows of one block, (rows, columns) float32, read-only."""

@@ -166,7 +166,9 @@ def turn(u: float) -> tuple[float, float]:
     a = (u - 0.25 * quarter) * (2.0 * math.pi)
     q = a * a
     c = 1.0 - q / 2.0 * (1.0 - q / 12.0 * (1.0 - q / 30.0 * (1.0 - q / 56.0 * (1.0 - q / 90.0 * (1.0 - q / 132.0)))))
-    s = a * (1.0 - q / 6.0 * (1.0 - q / 20.0 * (1.0 - q / 42.0 * (1.0 - q / 72.0 * (1.0 - q / 110.0 * (1.0 - q / 156.0))))))
+    s = a * (
+        1.0 - q / 6.0 * (1.0 - q / 20.0 * (1.0 - q / 42.0 * (1.0 - q / 72.0 * (1.0 - q / 110.0 * (1.0 - q / 156.0)))))
+    )
     if quarter & 1:
         c, s = -s, c
     return (-c, -s) if quarter & 2 else (c, s)
@@ -197,7 +199,9 @@ def spawn(paths, seed, plain, directions, rays, starts, ways):  # type: ignore[n
         radius = math.sqrt(u2)
         c, s = turn(u3)
         entry = step(step(step((0.0, 0.0, 0.0), radius * c, t), radius * s, b), -math.sqrt(1.0 - u2), d)
-        start(rays[i], starts[i], ways[i], entry, entry, d, entry, d, 0.0, T.UNIT, key_of(seed, path, 1), -1, 0, 0, path)
+        start(
+            rays[i], starts[i], ways[i], entry, entry, d, entry, d, 0.0, T.UNIT, key_of(seed, path, 1), -1, 0, 0, path
+        )
 
 
 @njit(cache=True)
@@ -280,7 +284,11 @@ def count_offset(row, box, box_l, boxed, length, weight, r, z, phi):  # type: ig
     row[T.AT_R + rc] += weight
     row[T.AT_Z + zc] += weight
     if boxed:
-        pb, rb, zb = int(phi * (BOX_PHI / (2.0 * math.pi)) + (BOX_PHI + 0.5)) % BOX_PHI, rc * BOX_R // T.R, zc * BOX_Z // T.Z
+        pb, rb, zb = (
+            int(phi * (BOX_PHI / (2.0 * math.pi)) + (BOX_PHI + 0.5)) % BOX_PHI,
+            rc * BOX_R // T.R,
+            zc * BOX_Z // T.Z,
+        )
         lb = min(int(length * (BOX_L / T.BOX_LENGTH)), BOX_L - 1)
         box[pb, rb, zb] += weight
         box_l[lb, pb] += weight
