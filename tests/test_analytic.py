@@ -1,5 +1,6 @@
 """The exact sphere against printed numbers, another program, a vector ray trace, itself by other routes."""
 
+import math
 import time
 from pathlib import Path
 
@@ -466,3 +467,14 @@ def test_what_cannot_be_meant_is_refused_in_one_line(call):
     with pytest.raises(UsageError) as caught:
         call()
     assert str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_henyey_greenstein_masses():
+    """A lobe holds all its energy and its mean cosine is g, also next to isotropic and next to a spike."""
+    edges = np.cos(np.linspace(math.pi, 0.0, 2001))
+    edges[[0, -1]] = -1.0, 1.0
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    for g in (-0.7, 0.0, 1e-12, 0.3, 0.95):
+        masses = analytic.henyey_greenstein(g, edges)
+        assert masses.sum() == pytest.approx(1.0, abs=1e-12)
+        assert masses @ middle == pytest.approx(g, abs=1e-5)

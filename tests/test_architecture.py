@@ -15,7 +15,7 @@ ROOT = PACKAGE.parent
 # What each module may import of the package: only what stands below it.
 LAYERS = [
     {"errors"},
-    {"optics", "materials", "table", "tally", "analytic", "exemplars", "surface"},
+    {"files", "optics", "materials", "table", "tally", "analytic", "exemplars", "surface"},
     {"grains", "format", "estimate"},
     {"tracer", "exact"},
     {"scatterometer", "validate", "plots"},

@@ -20,7 +20,7 @@ from tsdf.optics import Optics
 from tsdf.table import Table, thawed
 from tsdf.tally import Tally
 from tsdf.tracer import Tracer
-from tsdf.validate import CODES, henyey_greenstein, judge, reference, validate, zhou_curve
+from tsdf.validate import CODES, judge, reference, validate, zhou_curve
 
 CHECKS = make_checks.CHECKS
 FAULTS = sorted(path.name.removesuffix(".json") for path in CHECKS.glob("*.json"))
@@ -182,13 +182,3 @@ def test_zhou_curve_is_the_published_one():
     np.testing.assert_allclose(mine, curve, rtol=4e-3)
     circles = reference("zhou2003_fig8_montecarlo.csv")
     assert len(circles["theta_deg"]) == 17
-
-
-def test_henyey_greenstein_masses():
-    edges = np.cos(np.linspace(math.pi, 0.0, 2001))
-    edges[[0, -1]] = -1.0, 1.0
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    for g in (-0.7, 0.0, 1e-12, 0.3, 0.95):
-        masses = henyey_greenstein(g, edges)
-        assert masses.sum() == pytest.approx(1.0, abs=1e-12)
-        assert masses @ middle == pytest.approx(g, abs=1e-5)

@@ -749,6 +749,28 @@ def fresnel_reflectance(cos_theta_i: ArrayLike, eta: float) -> tuple[Array, Arra
     return rs.reshape(shape), rp.reshape(shape)
 
 
+def henyey_greenstein(g: float, edges: Array) -> Array:
+    """Return the mass of a Henyey-Greenstein lobe in each cell of cos theta.
+
+    Parameters
+    ----------
+    g : float
+        Mean cosine, in (-1, 1) [1].
+    edges : (n + 1,) float64
+        Cells of cos theta, ascending in [-1, 1].
+
+    Returns
+    -------
+    (n,) float64
+        Henyey & Greenstein 1941, integrated in closed form.
+    """
+    if abs(g) < 1e-9:
+        return 0.5 * np.diff(edges)
+    # 1/sqrt(1 + g^2 - 2 g mu), written so that mu = 1 and g near 1 keep their digits
+    inverse = 1.0 / np.sqrt((1.0 - g) ** 2 + 2.0 * g * (1.0 - edges))
+    return (1.0 - g * g) / (2.0 * g) * np.diff(inverse)
+
+
 @dataclass(frozen=True)
 class ConvexTheorems:
     """What holds for every convex grain, whatever its shape (Cauchy; Dirac's mean chord).

@@ -12,7 +12,6 @@ import json
 import math
 import os
 import re
-import secrets
 import stat
 import struct
 import warnings
@@ -28,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from tsdf.errors import Finding, FormatError, FormatWarning, TSDFError
+from tsdf.files import replacing
 from tsdf.table import CONDITIONALS, FORMAT_VERSION, RECORD_FIELDS, Table, thawed
 
 # code: (severity, rule). The set is closed; SPEC.md lists it and `reference_data/golden` breaks each of them.
@@ -207,18 +207,8 @@ def write(table: Table, path: str | os.PathLike[str]) -> None:
         If the table breaks a rule of SPEC.md or the file cannot be written; nothing is left behind.
     """
     try:
-        target = Path(os.path.realpath(path))
-        if target.exists() and not target.is_file():
-            raise OSError("there is something other than a regular file")
-        temporary = target.with_name(f".{secrets.token_hex(8)}.tmp")
-        try:
+        with replacing(path) as temporary:
             _write_checked(table, temporary)
-            os.replace(temporary, target)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as error:
-        reason = f"{error.strerror or error}; check the directory, the permissions and the free space"
-        raise TSDFError(f"cannot write {_shown(path)}: {reason}") from error
     except (RuntimeError, ValueError, TypeError) as error:  # OpenEXR raises the first
         raise TSDFError(f"cannot write {_shown(path)}: {_shown(error)}") from error
 

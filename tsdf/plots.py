@@ -6,16 +6,16 @@ Figures are made without pyplot, so nothing global changes, and `save` writes th
 import io
 import math
 import os
-import secrets
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tsdf import analytic
-from tsdf.errors import TSDFError, UsageError
+from tsdf.errors import UsageError
+from tsdf.files import replacing
 from tsdf.table import Table
-from tsdf.validate import ROUNDING, ZHOU_ETA, henyey_greenstein, reference
+from tsdf.validate import ROUNDING, ZHOU_ETA, reference
 
 SUFFIXES = (".png", ".pdf")
 DPI = 160
@@ -61,19 +61,8 @@ def save(figure: Any, path: str | os.PathLike[str]) -> None:
     buffer = io.BytesIO()
     with matplotlib.rc_context(STYLE):
         figure.savefig(buffer, format=kind, dpi=DPI, metadata=unstamped[kind])
-    target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{secrets.token_hex(8)}.tmp")
-    try:
-        if target.exists() and not target.is_file():
-            raise OSError("there is something other than a regular file")
-        try:
-            temporary.write_bytes(buffer.getvalue())
-            os.replace(temporary, target)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as error:
-        reason = error.strerror or error
-        raise TSDFError(f"cannot write {os.fspath(path)}: {reason}; check the directory and the permissions") from error
+    with replacing(path) as temporary:
+        temporary.write_bytes(buffer.getvalue())
 
 
 def plot_table(table: Table) -> Any:
@@ -301,9 +290,9 @@ def _fits(axes: Any, table: Table) -> None:
     fine = np.cos(np.linspace(math.pi, 0.0, 2001))
     middle = 0.5 * (fine[1:] + fine[:-1])
     one, two = stated["henyey_greenstein"], stated["two_lobe"]
-    lobe = henyey_greenstein(one["g"], fine) / np.diff(fine)
-    lobes = two["weight"] * henyey_greenstein(two["g1"], fine)
-    lobes = (lobes + (1.0 - two["weight"]) * henyey_greenstein(two["g2"], fine)) / np.diff(fine)
+    lobe = analytic.henyey_greenstein(one["g"], fine) / np.diff(fine)
+    lobes = two["weight"] * analytic.henyey_greenstein(two["g1"], fine)
+    lobes = (lobes + (1.0 - two["weight"]) * analytic.henyey_greenstein(two["g2"], fine)) / np.diff(fine)
     spread = np.sqrt(table.p_theta)
     # the stated noise, shared out among the columns as that of counts
     scale = error["sampling_noise"] / (math.sqrt(0.5 / math.pi) * max(float(spread.sum()), 1e-300))

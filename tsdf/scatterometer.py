@@ -8,7 +8,6 @@ or not, in one piece or in parts merged afterwards. After each chunk the counts 
 import io
 import json
 import math
-import os
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -22,6 +21,7 @@ from tsdf import estimate
 from tsdf import tally as T
 from tsdf.errors import GrainError, TSDFError, UsageError
 from tsdf.exact import exact_table
+from tsdf.files import replacing
 from tsdf.grains import Grain
 from tsdf.optics import Optics
 from tsdf.table import Table
@@ -415,15 +415,14 @@ class Build:
         TSDFError
             If it cannot be written; the file that stood there is left as it was.
         """
-        buffer = io.BytesIO()
         request = np.frombuffer(json.dumps(self.request).encode(), dtype=np.uint8)
         arrays: dict[str, Any] = {
             "request": request,
             "done": np.array(sorted(self.done), dtype=np.int64),
             **self.tally.arrays(),
         }
-        np.savez(buffer, **arrays)
-        write_atomically(path, buffer.getvalue())
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, **arrays)
 
     @classmethod
     def load(cls, path: Path) -> "Build":
@@ -482,23 +481,3 @@ def merge(paths: list[Path]) -> Build:
         whole.tally.add(other.tally)
         whole.done |= other.done
     return whole
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file beside its place and move it there.
-
-    Raises
-    ------
-    TSDFError
-        If that fails; nothing is left behind.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
-    except BaseException as error:
-        temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            reason = error.strerror or str(error)
-            raise TSDFError(f"cannot write {path}: {reason}; choose another place with --out") from None
-        raise

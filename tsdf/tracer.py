@@ -39,6 +39,11 @@ RAY = np.dtype(
 )  # fmt: skip
 INSIDE, RETRIED, MET = 1, 2, 4
 
+# Light that leaves is counted in blocks. Rows of `left`: where it starts for the rim, its direction, where the light
+# entered, its direction, the length inside (13); of `notes`: weight, path, key; of `found`, see `measure`:
+BLOCK = 128  # small enough for the first-level cache
+COS_THETA, THETA, FORTH, BACK = 0, 1, 2, 5  # r, z, phi_delta follow in the rows from FORTH and BACK
+
 BOX_PHI, BOX_R, BOX_Z, BOX_L = (T.BOX[name] for name in ("phi", "r", "z", "l"))
 
 # Direction numbers of the first four dimensions of Sobol' sequences (Joe & Kuo 2008: s, a, m)
@@ -144,9 +149,22 @@ def step(a, t, b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def triple(row):  # type: ignore[no-untyped-def]
-    """Return the first three elements of an array; the compiler keeps triples in registers."""
-    return float(row[0]), float(row[1]), float(row[2])
+def minus(a):  # type: ignore[no-untyped-def]
+    """Return -a of a triple."""
+    return -a[0], -a[1], -a[2]
+
+
+@njit(cache=True)
+def rim(p, d):  # type: ignore[no-untyped-def]
+    """Return where light from p along d leaves the bounding sphere."""
+    along = dot(p, d)
+    return step(p, math.sqrt(max(0.0, along * along + (1.0 - dot(p, p)))) - along, d)
+
+
+@njit(cache=True)
+def triple(v):  # type: ignore[no-untyped-def]
+    """Return an array of three as a triple, which the compiler keeps in registers."""
+    return v[0], v[1], v[2]
 
 
 @njit(cache=True)
@@ -199,18 +217,17 @@ def spawn(paths, seed, plain, directions, rays, starts, ways):  # type: ignore[n
         radius = math.sqrt(u2)
         c, s = turn(u3)
         entry = step(step(step((0.0, 0.0, 0.0), radius * c, t), radius * s, b), -math.sqrt(1.0 - u2), d)
-        start(
-            rays[i], starts[i], ways[i], entry, entry, d, entry, d, 0.0, T.UNIT, key_of(seed, path, 1), -1, 0, 0, path
-        )
+        start(i, rays, starts, ways, entry, entry, d, entry, d, 0.0, T.UNIT, key_of(seed, path, 1), -1, 0, 0, path)
 
 
-@njit(cache=True)
-def start(ray, origin, way, p, shifted, d, entry, d_in, length, weight, key, facet, flags, hits, path):  # type: ignore[no-untyped-def]
-    """Write one ray from p along d, and for the ray engine from `shifted`."""
+@njit(cache=True, inline="always")
+def start(i, rays, starts, ways, p, shifted, d, entry, d_in, length, weight, key, facet, flags, hits, path):  # type: ignore[no-untyped-def]
+    """Write ray i from p along d, and for the ray engine from `shifted`."""
     unit_length = 1.5 - 0.5 * dot(d, d)  # a step of Newton's: keeps rounding errors from piling up
+    ray = rays[i]
     for k in range(3):
         ray.p[k], ray.d[k], ray.entry[k], ray.d_in[k] = p[k], d[k] * unit_length, entry[k], d_in[k]
-        origin[k], way[k] = shifted[k], d[k] * unit_length
+        starts[i, k], ways[i, k] = shifted[k], d[k] * unit_length
     ray.length, ray.weight, ray.key, ray.path = length, weight, key, path
     ray.facet, ray.flags, ray.hits = facet, flags, hits
 
@@ -230,10 +247,12 @@ def length_cell(length, edges):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def arc(y: float, x: float) -> float:
-    """Return atan2(y, x) to 1e-10, the same on every machine; a Chebyshev fit of atan(a) / a in a^2."""
+    """Return atan2(y, x) to 1e-10, the same on every machine; a Chebyshev fit of atan(a) / a in a^2.
+
+    Without branches, so that the compiler can do several at once.
+    """
     ay, ax = abs(y), abs(x)
-    low, high = min(ay, ax), max(ay, ax)
-    a = low / high if high > 0.0 else 0.0
+    a = min(ay, ax) / max(ay, ax, 1e-300)
     q = a * a
     s = 0.004827227698418 - 0.0006804972611845 * q
     s = 0.03413342266011 + q * (-0.01605516042953 + q * s)
@@ -241,10 +260,8 @@ def arc(y: float, x: float) -> float:
     s = 0.1109298478666 + q * (-0.08979051044096 + q * s)
     s = 0.1999990995702 + q * (-0.1428394842117 + q * s)
     s = a * (0.999999999939 + q * (-0.333333315182 + q * s))
-    if ay > ax:
-        s = 0.5 * math.pi - s
-    if x < 0.0:
-        s = math.pi - s
+    s = 0.5 * math.pi - s if ay > ax else s
+    s = math.pi - s if x < 0.0 else s
     return -s if y < 0.0 else s
 
 
@@ -276,102 +293,157 @@ def keep(records, c, weight, key, r, z, phi, length, p, d, out):  # type: ignore
 
 
 @njit(cache=True)
-def count_offset(row, box, box_l, boxed, length, weight, r, z, phi):  # type: ignore[no-untyped-def]
-    """Count one offset in the conditionals and, if `boxed`, in the joint distributions."""
-    rc = min(int(r * (T.R / 2.0)), T.R - 1)
-    zc = min(max(int((z + 1.0) * (T.Z / 3.0)), 0), T.Z - 1)
-    row[T.AT_PHI + int(phi * (T.PHI / (2.0 * math.pi)) + (T.PHI + 0.5)) % T.PHI] += weight
-    row[T.AT_R + rc] += weight
-    row[T.AT_Z + zc] += weight
-    if boxed:
-        pb, rb, zb = (
-            int(phi * (BOX_PHI / (2.0 * math.pi)) + (BOX_PHI + 0.5)) % BOX_PHI,
-            rc * BOX_R // T.R,
-            zc * BOX_Z // T.Z,
-        )
-        lb = min(int(length * (BOX_L / T.BOX_LENGTH)), BOX_L - 1)
-        box[pb, rb, zb] += weight
-        box_l[lb, pb] += weight
-        box_l[lb, BOX_PHI + rb] += weight
-        box_l[lb, BOX_PHI + BOX_R + zb] += weight
-
-
-@njit(cache=True)
 def rounded(x: float) -> int:
     """Return the nearest integer."""
     return np.int64(math.floor(x + 0.5))
 
 
+@njit(cache=True, inline="always")
+def row(block, i):  # type: ignore[no-untyped-def]
+    """Return the first three elements of a row."""
+    return block[i, 0], block[i, 1], block[i, 2]
+
+
+@njit(cache=True, inline="always")
+def column(block, row, i):  # type: ignore[no-untyped-def]
+    """Return three elements of a column."""
+    return block[row, i], block[row + 1, i], block[row + 2, i]
+
+
 @njit(cache=True, error_model="numpy")
-def leave(p, d, length, entry, d_in, weight, key, path, edges, counters):  # type: ignore[no-untyped-def]
-    """Count light that leaves point p along d for good, as it is and walked backwards, which is as likely."""
-    scalars, theta, cells, box, box_l, records = counters
-    along = dot(p, d)
-    exit = step(p, math.sqrt(max(0.0, along * along + (1.0 - dot(p, p)))) - along, d)
-    offset = step(exit, -1.0, entry)
-    axis = cross(d_in, d)
-    cos_theta, sin_theta = dot(d_in, d), math.sqrt(dot(axis, axis))
-    z, z_back = dot(offset, d_in), dot(offset, d)
-    across, across_back = cross(offset, d_in), cross(offset, d)
-    r, r_back = math.sqrt(dot(across, across)), math.sqrt(dot(across_back, across_back))
+def measure(count, left, found):  # type: ignore[no-untyped-def]
+    """Find cos theta, theta, and r, z, phi_delta forwards and backwards of the first `count` columns of `left`.
 
-    if sin_theta < ATOM:  # no azimuth of its own: phi_delta from the side on which the light entered
-        away = 0 if cos_theta > 0.0 else 1
-        f, c, g = T.FINE + away, T.COARSE + away, T.GROUPS + away
-        side, side_back = step(entry, -dot(entry, d_in), d_in), step(exit, -dot(exit, d), d)
-        phi = arc(dot(d_in, cross(side, offset)), dot(side, offset))
-        phi_back = arc(dot(d, cross(side_back, offset)), -dot(side_back, offset))
-    else:
-        f = min(int(arc(sin_theta, cos_theta) * (T.FINE / math.pi)), T.FINE - 1)
-        c, g = f // (T.FINE // T.COARSE), f // (T.FINE // T.GROUPS)
-        sine = dot(offset, axis)
-        phi, phi_back = arc(sine, z_back - cos_theta * z), arc(sine, z - cos_theta * z_back)
+    A straight loop over arrays becomes vector instructions, five times faster; a ninth row of results, or a branch,
+    and the compiler gives up on that.
+    """
+    for i in range(count):
+        p, d, entry, d_in = column(left, 0, i), column(left, 3, i), column(left, 6, i), column(left, 9, i)
+        offset = step(rim(p, d), -1.0, entry)
+        axis, across, across_back = cross(d_in, d), cross(offset, d_in), cross(offset, d)
+        cos_theta, z, z_back = dot(d_in, d), dot(offset, d_in), dot(offset, d)
+        sine = dot(offset, axis)  # of phi_delta, times r sin theta; the same both ways
+        found[COS_THETA, i], found[THETA, i] = cos_theta, arc(math.sqrt(dot(axis, axis)), cos_theta)
+        found[FORTH, i], found[FORTH + 1, i] = math.sqrt(dot(across, across)), z
+        found[FORTH + 2, i] = arc(sine, z_back - cos_theta * z)
+        found[BACK, i], found[BACK + 1, i] = math.sqrt(dot(across_back, across_back)), z_back
+        found[BACK + 2, i] = arc(sine, z - cos_theta * z_back)
+
+
+@njit(cache=True)
+def side_azimuth(entry, d_in, exit):  # type: ignore[no-untyped-def]
+    """Return the azimuth of the offset from the side on which light enters, for light that is not deflected."""
+    side, offset = step(entry, -dot(entry, d_in), d_in), step(exit, -1.0, entry)
+    return arc(dot(d_in, cross(side, offset)), dot(side, offset))
+
+
+@njit(cache=True, inline="always")
+def count_offset(cells, c, box, box_l, half, g, lb, boxed, weight, r, z, phi):  # type: ignore[no-untyped-def]
+    """Count one offset in the conditionals and, if `boxed`, in the joint distributions."""
     phi = phi if r > 1e-9 else 0.0
-    phi_back = phi_back if r_back > 1e-9 else 0.0
+    rc = min(int(r * (T.R / 2.0)), T.R - 1)
+    zc = min(max(int((z + 1.0) * (T.Z / 3.0) + 1e-9), 0), T.Z - 1)  # z = 0, a reflection, must not fall on both sides
+    cells[c, T.AT_PHI + int(phi * (T.PHI / (2.0 * math.pi)) + (T.PHI + 0.5)) % T.PHI] += weight
+    cells[c, T.AT_R + rc] += weight
+    cells[c, T.AT_Z + zc] += weight
+    if boxed:
+        pb = int(phi * (BOX_PHI / (2.0 * math.pi)) + (BOX_PHI + 0.5)) % BOX_PHI
+        rb, zb = rc * BOX_R // T.R, zc * BOX_Z // T.Z
+        box[half, g, pb, rb, zb] += weight
+        box_l[half, g, lb, pb] += weight
+        box_l[half, g, lb, BOX_PHI + rb] += weight
+        box_l[half, g, lb, BOX_PHI + BOX_R + zb] += weight
 
-    replicate = path % T.REPLICATES
-    sums, row = scalars[replicate], cells[c]
-    sums[T.SCATTERED] += weight
-    sums[T.COS_THETA] += rounded(weight * cos_theta)
-    sums[T.MEAN_R] += rounded(weight * 0.5 * (r + r_back))
-    sums[T.MEAN_Z] += rounded(weight * 0.5 * (z + z_back))
-    sums[T.PATH_LENGTH] += rounded(weight * length)
-    sums[T.OFFSET] += rounded(weight * math.sqrt(dot(offset, offset)))
-    theta[replicate, f] += weight
-    lc = length_cell(length, edges)
-    row[T.AT_L + lc] += weight
-    row[T.AT_L_SUM + lc] += rounded(weight * length)
-    boxed = coin(path, 6) and coin(path, 7)  # a quarter of the paths tells the joint distributions well enough
-    half = replicate & 1
-    count_offset(row, box[half, g], box_l[half, g], boxed, length, weight, r, z, phi)
-    count_offset(row, box[half, g], box_l[half, g], boxed, length, weight, r_back, z_back, phi_back)
-    if records.shape[1] > 0:
-        d_back, d_out_back = (-d[0], -d[1], -d[2]), (-d_in[0], -d_in[1], -d_in[2])
-        keep(records, c, weight, mix(key + np.uint64(0x51)), r, z, phi, length, entry, d_in, d)
-        keep(records, c, weight, mix(key + np.uint64(0x52)), r_back, z_back, phi_back, length, exit, d_back, d_out_back)
+
+@njit(cache=True)
+def count_block(count, block, edges, counters):  # type: ignore[no-untyped-def]
+    """Count the light of a block's first `count` columns, as it is and walked backwards, which is as likely."""
+    left, notes, found = block
+    scalars, theta, cells, box, box_l, records = counters
+    measure(count, left, found)
+    for i in range(count):
+        p, d, entry, d_in = column(left, 0, i), column(left, 3, i), column(left, 6, i), column(left, 9, i)
+        length, weight, path, key = left[12, i], notes[0, i], notes[1, i], np.uint64(notes[2, i])
+        cos_theta, angle = found[COS_THETA, i], found[THETA, i]
+        r, z, phi = column(found, FORTH, i)
+        r_back, z_back, phi_back = column(found, BACK, i)
+        if ATOM < angle < math.pi - ATOM:
+            f = min(int(angle * (T.FINE / math.pi)), T.FINE - 1)
+            c, g = f // (T.FINE // T.COARSE), f // (T.FINE // T.GROUPS)
+        else:
+            away = 0 if cos_theta > 0.0 else 1
+            f, c, g = T.FINE + away, T.COARSE + away, T.GROUPS + away
+            phi = side_azimuth(entry, d_in, rim(p, d))
+            phi_back = side_azimuth(rim(p, d), minus(d), entry)
+
+        replicate = path % T.REPLICATES
+        energy_length = rounded(weight * length)
+        scalars[replicate, T.SCATTERED] += weight
+        scalars[replicate, T.COS_THETA] += rounded(weight * cos_theta)
+        scalars[replicate, T.MEAN_R] += rounded(weight * 0.5 * (r + r_back))
+        scalars[replicate, T.MEAN_Z] += rounded(weight * 0.5 * (z + z_back))
+        scalars[replicate, T.PATH_LENGTH] += energy_length
+        scalars[replicate, T.OFFSET] += rounded(weight * math.sqrt(r * r + z * z))
+        theta[replicate, f] += weight
+        lc = length_cell(length, edges)
+        cells[c, T.AT_L + lc] += weight
+        cells[c, T.AT_L_SUM + lc] += energy_length
+        boxed = coin(path, 6) and coin(path, 7)  # a quarter of the paths tells the joint distributions well enough
+        half, lb = replicate & 1, min(int(length * (BOX_L / T.BOX_LENGTH)), BOX_L - 1)
+        count_offset(cells, c, box, box_l, half, g, lb, boxed, weight, r, z, phi)
+        count_offset(cells, c, box, box_l, half, g, lb, boxed, weight, r_back, z_back, phi_back)
+        if records.shape[1] > 0:
+            back, back_in = minus(d), minus(d_in)
+            keep(records, c, weight, mix(key + np.uint64(0x51)), r, z, phi, length, entry, d_in, d)
+            keep(
+                records,
+                c,
+                weight,
+                mix(key + np.uint64(0x52)),
+                r_back,
+                z_back,
+                phi_back,
+                length,
+                rim(p, d),
+                back,
+                back_in,
+            )
+
+
+@njit(cache=True, inline="always")
+def leave(i, left, notes, p, d, length, entry, d_in, weight, key, path):  # type: ignore[no-untyped-def]
+    """Note in column i light that leaves point p along d for good."""
+    for k in range(3):
+        left[k, i], left[3 + k, i], left[6 + k, i], left[9 + k, i] = p[k], d[k], entry[k], d_in[k]
+    left[12, i], notes[0, i], notes[1, i], notes[2, i] = length, weight, path, np.int64(key)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def advance(count, prims, sphere, planes, centroids, horizon, eta, polarisation, reflectance_scale,  # type: ignore[no-untyped-def]
-            split, fan_size, max_hits, edges, rays, next_rays, starts, ways, counters):  # fmt: skip
+            split, fan_size, max_hits, edges, rays, next_rays, starts, ways, block, counters):  # fmt: skip
     """Take `count` rays, whose next facets are `prims`, through one hit each; return how many go on.
 
     What goes on is packed into next_rays and, for the ray engine, starts and ways.
     """
-    live = 0
+    scalars, (left, notes, _) = counters[0], block
+    live, held = 0, 0
     for i in range(count):
+        if held > BLOCK - fan_size:
+            count_block(held, block, edges, counters)
+            held = 0
         ray, facet = rays[i], prims[i]
         p, d, entry, d_in = triple(ray.p), triple(ray.d), triple(ray.entry), triple(ray.d_in)
         length, path, key, weight = ray.length, ray.path, ray.key, np.int64(ray.weight)
         inside, met = (ray.flags & INSIDE) != 0, (ray.flags & MET) != 0
-        sums = counters[0][path % T.REPLICATES]
+        replicate = path % T.REPLICATES
 
         if facet < 0 and not inside:
             if met:
-                leave(p, d, length, entry, d_in, weight, key, path, edges, counters)
+                leave(held, left, notes, p, d, length, entry, d_in, weight, key, path)
+                held += 1
             else:
-                sums[T.UNSCATTERED] += weight
-                sums[T.MISS_CHORD] += rounded(weight * -2.0 * dot(p, d))
+                scalars[replicate, T.UNSCATTERED] += weight
+                scalars[replicate, T.MISS_CHORD] += rounded(weight * -2.0 * dot(p, d))
             continue
 
         # The hit, on the facet's plane (or the sphere), with its normal
@@ -383,17 +455,17 @@ def advance(count, prims, sphere, planes, centroids, horizon, eta, polarisation,
             n = step((0.0, 0.0, 0.0), 1.0 / math.sqrt(dot(n, n)), n)
             cosine = dot(n, d)
         elif not lost:
-            n = triple(planes[facet])
+            n = row(planes, facet)
             cosine = dot(n, d)
             t = (planes[facet, 3] - dot(n, p)) / cosine
         if lost or (cosine > 0.0) != inside or not (-10.0 * OFFSET <= t <= 2.5):
             # A leak at an edge or a vertex: once more from nearer the middle of the facet it came from
             if ray.facet < 0 or ray.flags & RETRIED:
-                sums[T.LOST] += weight
+                scalars[replicate, T.LOST] += weight
             else:
-                moved = step(p, RETRY, step(triple(centroids[ray.facet]), -1.0, p))
-                moved = step(moved, -OFFSET if inside else OFFSET, triple(planes[ray.facet]))
-                start(next_rays[live], starts[live], ways[live], p, moved, d, entry, d_in, length, weight, key,
+                moved = step(p, RETRY, step(row(centroids, ray.facet), -1.0, p))
+                moved = step(moved, -OFFSET if inside else OFFSET, row(planes, ray.facet))
+                start(live, next_rays, starts, ways, p, moved, d, entry, d_in, length, weight, key,
                       ray.facet, ray.flags | RETRIED, ray.hits, path)  # fmt: skip
                 live += 1
             continue
@@ -404,7 +476,7 @@ def advance(count, prims, sphere, planes, centroids, horizon, eta, polarisation,
             length += t
         hits = ray.hits + 1
         if hits > max_hits:
-            sums[T.TRUNCATED] += weight
+            scalars[replicate, T.TRUNCATED] += weight
             continue
 
         # Above the horizon of a facet light comes unobstructed: one point, several directions
@@ -428,8 +500,7 @@ def advance(count, prims, sphere, planes, centroids, horizon, eta, polarisation,
                 cosine = -math.sqrt(max(1.0 - u, 1e-300))
                 d = step(step(step((0.0, 0.0, 0.0), math.sqrt(u) * turn_c, tangent), math.sqrt(u) * turn_s, bitangent),
                          cosine, n)  # fmt: skip
-                along = dot(p, d)
-                entry, d_in = step(p, -along - math.sqrt(max(0.0, along * along + (1.0 - dot(p, p)))), d), d
+                entry, d_in = rim(p, minus(d)), d
 
             # Reflection and refraction; one of the two goes on outside (out), the other inside (into)
             ratio = 1.0 / eta if inside else eta
@@ -455,15 +526,17 @@ def advance(count, prims, sphere, planes, centroids, horizon, eta, polarisation,
                 out_weight = kept if lighter == out_weight else weight - kept
             if out_weight > 0:
                 if free:
-                    leave(p, out, length, entry, d_in, out_weight, key, path, edges, counters)
+                    leave(held, left, notes, p, out, length, entry, d_in, out_weight, key, path)
+                    held += 1
                 else:
-                    start(next_rays[live], starts[live], ways[live], p, step(p, OFFSET, n), out, entry, d_in, length,
+                    start(live, next_rays, starts, ways, p, step(p, OFFSET, n), out, entry, d_in, length,
                           out_weight, mix(key ^ np.uint64(0xA5A5A5A5A5A5A5A5)), facet, MET, hits, path)  # fmt: skip
                     live += 1
             if out_weight < weight:
-                start(next_rays[live], starts[live], ways[live], p, step(p, -OFFSET, n), into, entry, d_in, length,
+                start(live, next_rays, starts, ways, p, step(p, -OFFSET, n), into, entry, d_in, length,
                       weight - out_weight, key, facet, MET | INSIDE, hits, path)  # fmt: skip
                 live += 1
+    count_block(held, block, edges, counters)
     return live
 
 
@@ -587,6 +660,7 @@ class Tracer:
                 else horizon_of(self.grain.vertices, self.grain.faces, self._planes)
             )  # fmt: skip
             self._scene = embree_scene(self.grain)
+        self._block = np.empty((13, BLOCK)), np.empty((3, BLOCK), dtype=np.int64), np.empty((8, BLOCK))
         self._rays, self._next = np.empty(0, RAY), np.empty(0, RAY)
         self._reserve((1 + self.fan) * self.slots)
 
@@ -626,7 +700,7 @@ class Tracer:
             live = advance(
                 live, prims, self._sphere, self._planes, self._centroids, self._horizon, self.eta, self._polarisation,
                 self.reflectance_scale, split, fan, self.max_bounces, T.L_EDGES, self._rays, self._next,
-                self._starts, self._ways, counters,
+                self._starts, self._ways, self._block, counters,
             )  # fmt: skip
             self._rays, self._next = self._next, self._rays
         return total
