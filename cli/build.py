@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from tsdf.cli.common import Tool
 
+from tsdf.cli.common import Tool
 from tsdf.errors import TSDFError, UsageError
 
 if TYPE_CHECKING:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import click
+
 from tsdf.cli.common import Tool, plain
 
 if TYPE_CHECKING:

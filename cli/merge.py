@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import click
+
 from tsdf.cli.build import check_output, finish
 from tsdf.cli.common import Tool
 

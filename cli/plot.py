@@ -1,6 +1,7 @@
 """``tsdf-plot``: a picture of a table."""
 
 import click
+
 from tsdf.cli.common import Tool
 
 

@@ -3,8 +3,8 @@
 import json
 
 import click
-from tsdf.cli.common import Tool, plain
 
+from tsdf.cli.common import Tool, plain
 from tsdf.errors import UsageError
 
 

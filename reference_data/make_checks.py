@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tsdf.reference_data.make_golden import Header, file
 
 from tsdf import format
+from tsdf.reference_data.make_golden import Header, file
 from tsdf.table import thawed
 
 CHECKS = Path(__file__).parent / "golden" / "checks"

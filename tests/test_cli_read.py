@@ -11,12 +11,12 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
-from tsdf.cli import info, plot, validate
-from tsdf.cli.common import Tool, plain
-from tsdf.reference_data.make_checks import CHECKS
 
 from tsdf import format
+from tsdf.cli import info, plot, validate
+from tsdf.cli.common import Tool, plain
 from tsdf.errors import FormatWarning, TSDFError, UsageError
+from tsdf.reference_data.make_checks import CHECKS
 
 SPHERE, CUBE = str(CHECKS / "sphere.tsdf.exr"), str(CHECKS / "cube.tsdf.exr")
 WRONG = str(CHECKS / "PHYSICS_CHORD.tsdf.exr")

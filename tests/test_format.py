@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tsdf.reference_data import make_golden
 
 import tsdf
 from tsdf import format as fmt
 from tsdf.errors import FormatError, FormatWarning, TSDFError
+from tsdf.reference_data import make_golden
 from tsdf.table import Table, thawed
 
 ROOT = Path(__file__).parents[1]

@@ -6,10 +6,10 @@ import sys
 
 import numpy as np
 import pytest
-from tsdf.reference_data.make_checks import CHECKS
 
 from tsdf import format, plots
 from tsdf.errors import TSDFError, UsageError
+from tsdf.reference_data.make_checks import CHECKS
 from tsdf.table import Table, thawed
 
 

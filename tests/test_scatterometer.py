@@ -1,5 +1,6 @@
 """How tables are made: the same bytes whatever the way, honest errors, and the physics of simple solids."""
 
+import itertools
 import math
 import subprocess
 import sys
@@ -146,7 +147,7 @@ def test_chunks_cover_all_paths_once() -> None:
     for paths in (1024, 8192, 8193, 3_000_000):
         limits = list(chunks(paths))
         assert limits[0][0] == 0 and limits[-1][1] == paths
-        assert all(a[1] == b[0] for a, b in zip(limits, limits[1:], strict=False))
+        assert all(a[1] == b[0] for a, b in itertools.pairwise(limits))
         assert all(b - a <= max(scatterometer.CHUNK_MIN, a // 8) for a, b in limits)
 
 

@@ -5,18 +5,17 @@ wrong on purpose. Sound tables, exact and traced, must pass: a false alarm is as
 """
 
 import json
-import math
 import re
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tsdf.reference_data import make_checks
 
 from tsdf import estimate, format
 from tsdf.grains import load_grain
 from tsdf.optics import Optics
+from tsdf.reference_data import make_checks
 from tsdf.table import Table, thawed
 from tsdf.tally import Tally
 from tsdf.tracer import Tracer

@@ -20,9 +20,15 @@ GROUPS = 64  # cells of theta in which joint distributions are counted; divides 
 PHI, R, Z = 32, 64, 96  # cells of phi_Delta, r, z
 BOX = {"phi": 8, "r": 16, "z": 16, "l": 16}  # cells of the joint distributions
 BOX_LENGTH = 6.0  # path lengths from here on share the last cell of "l" [R]
-# Path length: nothing, 1/16 up to 4, quarter octaves up to 16, then octaves
+# Path length: nothing, 1/16 up to 6, quarter octaves up to 48, then octaves
+L_FINE, L_STEP = 6.0, 16
 L_EDGES = np.concatenate(
-    ([0.0, 0.0], np.arange(1, 65) / 16.0, 4.0 * 2.0 ** (np.arange(1, 9) / 4.0), 16.0 * 2.0 ** np.arange(1, 17))
+    (
+        [0.0],
+        np.arange(int(L_FINE * L_STEP)) / L_STEP,
+        L_FINE * 2.0 ** (np.arange(13) / 4.0),
+        48.0 * 2.0 ** np.arange(1, 16),
+    )
 )
 L = len(L_EDGES) - 1
 PHI_EDGES = (2.0 * np.arange(PHI + 1) - 1.0) * np.pi / PHI
@@ -54,10 +60,6 @@ LAUNCHED, UNSCATTERED, SCATTERED, TRUNCATED, LOST, COS_THETA, MEAN_R, MEAN_Z, PA
 RECORD = 8
 
 
-def _zeros(*shape: int) -> np.ndarray:
-    return field(default_factory=lambda: np.zeros(shape, dtype=np.int64))
-
-
 @dataclass(eq=False)
 class Tally:
     """Sums over paths, [units of energy] unless said otherwise.
@@ -82,11 +84,13 @@ class Tally:
     """
 
     joint: int = 0
-    scalars: np.ndarray = _zeros(REPLICATES, len(SCALARS))
-    theta: np.ndarray = _zeros(REPLICATES, FINE + 2)
-    cells: np.ndarray = _zeros(COARSE + 2, PHI + R + Z + 2 * L)
-    box: np.ndarray = _zeros(2, GROUPS + 2, BOX["phi"], BOX["r"], BOX["z"])
-    box_l: np.ndarray = _zeros(2, GROUPS + 2, BOX["l"], BOX["phi"] + BOX["r"] + BOX["z"])
+    scalars: np.ndarray = field(default_factory=lambda: np.zeros((REPLICATES, len(SCALARS)), np.int64))
+    theta: np.ndarray = field(default_factory=lambda: np.zeros((REPLICATES, FINE + 2), np.int64))
+    cells: np.ndarray = field(default_factory=lambda: np.zeros((COARSE + 2, PHI + R + Z + 2 * L), np.int64))
+    box: np.ndarray = field(default_factory=lambda: np.zeros((2, GROUPS + 2, BOX["phi"], BOX["r"], BOX["z"]), np.int64))
+    box_l: np.ndarray = field(
+        default_factory=lambda: np.zeros((2, GROUPS + 2, BOX["l"], BOX["phi"] + BOX["r"] + BOX["z"]), np.int64)
+    )
     records: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:

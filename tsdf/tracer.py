@@ -10,9 +10,9 @@ function of the seed and the path's number, so paths may be traced in any order,
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Event
-from collections.abc import Callable
 
 import numpy as np
 from numba import njit
@@ -25,10 +25,12 @@ from tsdf.tally import Tally
 OFFSET = 1e-5  # restart distance along the geometric normal [R], measured: design notes in physics.md §6
 UNKNOWN = 2.0  # horizon of a facet of which nothing is known: no sine exceeds it
 RETRY = 1e-3  # share of the way to the facet's centroid by which a failed restart is moved
+NO_OFFSET = 1e-9  # light that leaves this near to where it came in leaves there [R]
 ATOM = 1e-5  # deflections closer than this to 0 or pi are exact for float32 geometry [rad]
-SPLIT = 0.2  # a part lighter than this share of the light that enters is raised to it at random
-FAN = 4  # directions in which a facet is lit from one point
-SLOTS = 16384  # rays under way at once, per thread
+SPLIT = 0.6  # a part lighter than this share of the light that enters is raised to it at random
+FAN = 4  # directions in which a facet is lit from one point, half as many in a grain that shades itself
+OPEN = 0.9  # share of the light that comes in above the horizon of a grain that does not
+SLOTS = 4096  # rays under way at once, per thread, but for splitting: their state stays in the second-level cache
 MAX_BOUNCES = 100_000  # default bounce limit
 
 # A ray under way: where it starts and goes, the length inside so far, the light that entered, its random key and path,
@@ -68,7 +70,7 @@ GOLDEN_C, GOLDEN_S = math.cos(2.0 * math.pi * 0.6180339887498949), math.sin(2.0 
 
 
 @njit(cache=True)
-def mix(x: int) -> int:
+def mix(x):
     """Return 64 well-mixed bits of a uint64 (the finaliser of SplitMix64, Steele et al. 2014)."""
     x = np.uint64(x)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -77,7 +79,7 @@ def mix(x: int) -> int:
 
 
 @njit(cache=True)
-def key_of(seed: int, a: int, b: int) -> int:
+def key_of(seed, a, b):
     """Return the random key of item (a, b) of a seed, uint64."""
     k = mix(np.uint64(seed) + np.uint64(0x9E3779B97F4A7C15))
     k = mix(k ^ (np.uint64(a) * np.uint64(0xD1342543DE82EF95)))
@@ -85,19 +87,19 @@ def key_of(seed: int, a: int, b: int) -> int:
 
 
 @njit(cache=True)
-def unit(key: int) -> float:
+def unit(key):
     """Return a float64 in [0, 1) from a uint64."""
     return float(np.uint64(key) >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
 @njit(cache=True)
-def coin(path: int, which: int) -> int:
+def coin(path, which):
     """Return 0 or 1, the same for the whole of a path."""
     return np.int64(mix(np.uint64(path) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(which)) >> np.uint64(63))
 
 
 @njit(cache=True)
-def reverse_bits(x: int) -> int:
+def reverse_bits(x):
     """Return a uint32 with its bits in reverse order."""
     x = np.uint32(x)
     x = ((x >> np.uint32(1)) & np.uint32(0x55555555)) | ((x & np.uint32(0x55555555)) << np.uint32(1))
@@ -108,7 +110,7 @@ def reverse_bits(x: int) -> int:
 
 
 @njit(cache=True)
-def sobol(index: int, dimension: int, scramble: int, directions: np.ndarray) -> float:
+def sobol(index, dimension, scramble, directions):
     """Return one coordinate of a nested-uniformly (Owen) scrambled Sobol' point, float64 in (0, 1).
 
     The scramble is the hash of Laine & Karras 2011 in the form of Burley 2020, a different tree for each `scramble`.
@@ -131,44 +133,44 @@ def sobol(index: int, dimension: int, scramble: int, directions: np.ndarray) -> 
 
 
 @njit(cache=True)
-def dot(a, b):  # type: ignore[no-untyped-def]
+def dot(a, b):
     """Return the scalar product of two triples of floats."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @njit(cache=True)
-def cross(a, b):  # type: ignore[no-untyped-def]
+def cross(a, b):
     """Return the vector product of two triples of floats."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @njit(cache=True)
-def step(a, t, b):  # type: ignore[no-untyped-def]
+def step(a, t, b):
     """Return a + t b of two triples of floats."""
     return a[0] + t * b[0], a[1] + t * b[1], a[2] + t * b[2]
 
 
 @njit(cache=True)
-def minus(a):  # type: ignore[no-untyped-def]
+def minus(a):
     """Return -a of a triple."""
     return -a[0], -a[1], -a[2]
 
 
 @njit(cache=True)
-def rim(p, d):  # type: ignore[no-untyped-def]
+def rim(p, d):
     """Return where light from p along d leaves the bounding sphere."""
     along = dot(p, d)
     return step(p, math.sqrt(max(0.0, along * along + (1.0 - dot(p, p)))) - along, d)
 
 
 @njit(cache=True)
-def triple(v):  # type: ignore[no-untyped-def]
+def triple(v):
     """Return an array of three as a triple, which the compiler keeps in registers."""
     return v[0], v[1], v[2]
 
 
 @njit(cache=True)
-def frame(n):  # type: ignore[no-untyped-def]
+def frame(n):
     """Return two unit vectors that complete a unit vector to a right-handed frame (Duff et al. 2017)."""
     x, y, z = n
     sign = math.copysign(1.0, z)
@@ -178,7 +180,7 @@ def frame(n):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def turn(u: float) -> tuple[float, float]:
+def turn(u):
     """Return cosine and sine of 2 pi u, u in [0, 1), to 1e-13, the same on every machine: Taylor series in quarters."""
     quarter = int(4.0 * u + 0.5)
     a = (u - 0.25 * quarter) * (2.0 * math.pi)
@@ -193,7 +195,7 @@ def turn(u: float) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True)
-def spawn(paths, seed, plain, directions, rays, starts, ways):  # type: ignore[no-untyped-def]
+def spawn(paths, seed, plain, directions, rays, starts, ways):
     """Start the paths numbered: parallel light, uniform over the disc, from everywhere."""
     low, high = np.uint64(0xFFFFFFFF), np.uint64(32)
     for i in range(len(paths)):
@@ -221,7 +223,7 @@ def spawn(paths, seed, plain, directions, rays, starts, ways):  # type: ignore[n
 
 
 @njit(cache=True, inline="always")
-def start(i, rays, starts, ways, p, shifted, d, entry, d_in, length, weight, key, facet, flags, hits, path):  # type: ignore[no-untyped-def]
+def start(i, rays, starts, ways, p, shifted, d, entry, d_in, length, weight, key, facet, flags, hits, path):
     """Write ray i from p along d, and for the ray engine from `shifted`."""
     unit_length = 1.5 - 0.5 * dot(d, d)  # a step of Newton's: keeps rounding errors from piling up
     ray = rays[i]
@@ -233,20 +235,20 @@ def start(i, rays, starts, ways, p, shifted, d, entry, d_in, length, weight, key
 
 
 @njit(cache=True)
-def length_cell(length, edges):  # type: ignore[no-untyped-def]
+def length_cell(length, edges):
     """Return the cell of `tally.L_EDGES` that holds a path length; 0 is the atom of light that never entered."""
     if length <= 0.0:
         return 0
-    if length < 4.0:
-        return 1 + int(length * 16.0)
-    k = 65
+    if length < T.L_FINE:
+        return 1 + int(length * T.L_STEP)
+    k = 1 + int(T.L_FINE * T.L_STEP)
     while k < edges.shape[0] - 2 and length >= edges[k + 1]:
         k += 1
     return k
 
 
 @njit(cache=True, error_model="numpy")
-def arc(y: float, x: float) -> float:
+def arc(y, x):
     """Return atan2(y, x) to 1e-10, the same on every machine; a Chebyshev fit of atan(a) / a in a^2.
 
     Without branches, so that the compiler can do several at once.
@@ -266,7 +268,7 @@ def arc(y: float, x: float) -> float:
 
 
 @njit(cache=True)
-def keep(records, c, weight, key, r, z, phi, length, p, d, out):  # type: ignore[no-untyped-def]
+def keep(records, c, weight, key, r, z, phi, length, p, d, out):
     """Offer the record of light that enters at p along d and leaves along `out` to the reservoir of cell `c`.
 
     It stays if its key -ln(u) / weight is among the smallest.
@@ -293,25 +295,25 @@ def keep(records, c, weight, key, r, z, phi, length, p, d, out):  # type: ignore
 
 
 @njit(cache=True)
-def rounded(x: float) -> int:
+def rounded(x):
     """Return the nearest integer."""
     return np.int64(math.floor(x + 0.5))
 
 
 @njit(cache=True, inline="always")
-def row(block, i):  # type: ignore[no-untyped-def]
+def row(block, i):
     """Return the first three elements of a row."""
     return block[i, 0], block[i, 1], block[i, 2]
 
 
 @njit(cache=True, inline="always")
-def column(block, row, i):  # type: ignore[no-untyped-def]
+def column(block, row, i):
     """Return three elements of a column."""
     return block[row, i], block[row + 1, i], block[row + 2, i]
 
 
 @njit(cache=True, error_model="numpy")
-def measure(count, left, found):  # type: ignore[no-untyped-def]
+def measure(count, left, found):
     """Find cos theta, theta, and r, z, phi_delta forwards and backwards of the first `count` columns of `left`.
 
     A straight loop over arrays becomes vector instructions, five times faster; a ninth row of results, or a branch,
@@ -331,16 +333,15 @@ def measure(count, left, found):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def side_azimuth(entry, d_in, exit):  # type: ignore[no-untyped-def]
+def side_azimuth(entry, d_in, exit):
     """Return the azimuth of the offset from the side on which light enters, for light that is not deflected."""
     side, offset = step(entry, -dot(entry, d_in), d_in), step(exit, -1.0, entry)
     return arc(dot(d_in, cross(side, offset)), dot(side, offset))
 
 
 @njit(cache=True, inline="always")
-def count_offset(cells, c, box, box_l, half, g, lb, boxed, weight, r, z, phi):  # type: ignore[no-untyped-def]
+def count_offset(cells, c, box, box_l, half, g, lb, boxed, weight, r, z, phi):
     """Count one offset in the conditionals and, if `boxed`, in the joint distributions."""
-    phi = phi if r > 1e-9 else 0.0
     rc = min(int(r * (T.R / 2.0)), T.R - 1)
     zc = min(max(int((z + 1.0) * (T.Z / 3.0) + 1e-9), 0), T.Z - 1)  # z = 0, a reflection, must not fall on both sides
     cells[c, T.AT_PHI + int(phi * (T.PHI / (2.0 * math.pi)) + (T.PHI + 0.5)) % T.PHI] += weight
@@ -356,7 +357,7 @@ def count_offset(cells, c, box, box_l, half, g, lb, boxed, weight, r, z, phi):  
 
 
 @njit(cache=True)
-def count_block(count, block, edges, counters):  # type: ignore[no-untyped-def]
+def count_block(count, block, edges, counters):
     """Count the light of a block's first `count` columns, as it is and walked backwards, which is as likely."""
     left, notes, found = block
     scalars, theta, cells, box, box_l, records = counters
@@ -376,6 +377,9 @@ def count_block(count, block, edges, counters):  # type: ignore[no-untyped-def]
             phi = side_azimuth(entry, d_in, rim(p, d))
             phi_back = side_azimuth(rim(p, d), minus(d), entry)
 
+        phi = phi if r > NO_OFFSET else 0.0  # else an azimuth of rounding errors
+        phi_back = phi_back if r_back > NO_OFFSET else 0.0
+
         replicate = path % T.REPLICATES
         energy_length = rounded(weight * length)
         scalars[replicate, T.SCATTERED] += weight
@@ -388,30 +392,21 @@ def count_block(count, block, edges, counters):  # type: ignore[no-untyped-def]
         lc = length_cell(length, edges)
         cells[c, T.AT_L + lc] += weight
         cells[c, T.AT_L_SUM + lc] += energy_length
-        boxed = coin(path, 6) and coin(path, 7)  # a quarter of the paths tells the joint distributions well enough
+        boxed = (
+            mix(np.uint64(path)) & np.uint64(7) == 0
+        )  # an eighth of the paths tells the joint distributions well enough
         half, lb = replicate & 1, min(int(length * (BOX_L / T.BOX_LENGTH)), BOX_L - 1)
         count_offset(cells, c, box, box_l, half, g, lb, boxed, weight, r, z, phi)
         count_offset(cells, c, box, box_l, half, g, lb, boxed, weight, r_back, z_back, phi_back)
         if records.shape[1] > 0:
             back, back_in = minus(d), minus(d_in)
             keep(records, c, weight, mix(key + np.uint64(0x51)), r, z, phi, length, entry, d_in, d)
-            keep(
-                records,
-                c,
-                weight,
-                mix(key + np.uint64(0x52)),
-                r_back,
-                z_back,
-                phi_back,
-                length,
-                rim(p, d),
-                back,
-                back_in,
-            )
+            again, exit = mix(key + np.uint64(0x52)), rim(p, d)
+            keep(records, c, weight, again, r_back, z_back, phi_back, length, exit, back, back_in)
 
 
 @njit(cache=True, inline="always")
-def leave(i, left, notes, p, d, length, entry, d_in, weight, key, path):  # type: ignore[no-untyped-def]
+def leave(i, left, notes, p, d, length, entry, d_in, weight, key, path):
     """Note in column i light that leaves point p along d for good."""
     for k in range(3):
         left[k, i], left[3 + k, i], left[6 + k, i], left[9 + k, i] = p[k], d[k], entry[k], d_in[k]
@@ -419,7 +414,7 @@ def leave(i, left, notes, p, d, length, entry, d_in, weight, key, path):  # type
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def advance(count, prims, sphere, planes, centroids, horizon, eta, polarisation, reflectance_scale,  # type: ignore[no-untyped-def]
+def advance(count, prims, sphere, planes, centroids, horizon, eta, polarisation, reflectance_scale,
             split, fan_size, max_hits, edges, rays, next_rays, starts, ways, block, counters):  # fmt: skip
     """Take `count` rays, whose next facets are `prims`, through one hit each; return how many go on.
 
@@ -541,7 +536,7 @@ def advance(count, prims, sphere, planes, centroids, horizon, eta, polarisation,
 
 
 @njit(cache=True, nogil=True)
-def _rise(facets, faces, planes, centroids, radii, corner_sines, horizon):  # type: ignore[no-untyped-def]
+def _rise(facets, faces, planes, centroids, radii, corner_sines, horizon):
     """Write into `horizon` a bound on the sine of the elevation of the grain over the `facets` listed."""
     for i in facets:
         top = 0.0
@@ -637,43 +632,44 @@ class Tracer:
     max_bounces: int = MAX_BOUNCES
     plain: bool = False
     reflectance_scale: float = 1.0
-    split: float = SPLIT
-    fan: int = FAN
     slots: int = SLOTS
     log: Callable[[np.ndarray, np.ndarray], None] | None = None
 
     def __post_init__(self) -> None:
         self._sphere = self.grain.kind == "sphere"
         self._polarisation = {"un": UNPOLARISED, "sp": 3}[self.fresnel]
-        if self._sphere:
-            self._planes, self._centroids = np.zeros((1, 4)), np.zeros((1, 3))
-            self._horizon = np.zeros(1)
-        else:
+        self._planes, self._centroids, self._horizon = np.zeros((1, 4)), np.zeros((1, 3)), np.zeros(1)
+        share = 1.0  # of the light that comes in above the horizon
+        if not self._sphere:
             corners = self.grain.vertices[self.grain.faces]
             normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            normals /= np.linalg.norm(normals, axis=1)[:, None]
+            double_areas = np.linalg.norm(normals, axis=1)
+            normals /= double_areas[:, None]
             self._centroids = corners.mean(axis=1)
-            height = np.einsum("ij,ij->i", normals, self._centroids)
-            self._planes = np.ascontiguousarray(np.column_stack((normals, height)))
-            self._horizon = (
-                np.full(len(normals), UNKNOWN) if self.plain
-                else horizon_of(self.grain.vertices, self.grain.faces, self._planes)
-            )  # fmt: skip
+            self._planes = np.column_stack((normals, np.einsum("ij,ij->i", normals, self._centroids)))
+            self._horizon = np.full(len(normals), UNKNOWN)
+            if not self.plain:
+                self._horizon = horizon_of(self.grain.vertices, self.grain.faces, self._planes)
+            share = np.average(np.maximum(1.0 - self._horizon**2, 0.0), weights=double_areas)
             self._scene = embree_scene(self.grain)
+        self._fan = 1 if self.plain else FAN if share > OPEN else FAN // 2
+        self._split = T.UNIT if self.plain else int(SPLIT * T.UNIT / self._fan)
         self._block = np.empty((13, BLOCK)), np.empty((3, BLOCK), dtype=np.int64), np.empty((8, BLOCK))
         self._rays, self._next = np.empty(0, RAY), np.empty(0, RAY)
-        self._reserve((1 + self.fan) * self.slots)
+        self._starts, self._ways = np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)
+        self._always = np.empty(0, np.int32)
+        self._reserve((1 + self._fan) * self.slots)
 
     def _reserve(self, capacity: int) -> None:
         """Make room for that many rays, keeping those under way."""
-        if capacity <= len(self._rays):
-            return
         old = len(self._rays)
-        kept = self._rays, *((self._starts, self._ways) if old else ())
+        if capacity <= old:
+            return
+        kept = self._rays, self._starts, self._ways
         self._rays, self._next = np.empty(capacity, RAY), np.empty(capacity, RAY)
         self._starts, self._ways = np.empty((capacity, 3), np.float32), np.empty((capacity, 3), np.float32)
         self._always = np.zeros(capacity, dtype=np.int32)
-        for new, mine in zip((self._rays, self._starts, self._ways), kept, strict=False):
+        for new, mine in zip((self._rays, self._starts, self._ways), kept, strict=True):
             new[:old] = mine
 
     def trace(self, paths: np.ndarray, tally: Tally, stop: Event | None = None) -> int:
@@ -682,8 +678,6 @@ class Tracer:
         Once `stop` is set the counts are worthless.
         """
         counters = (tally.scalars, tally.theta, tally.cells, tally.box, tally.box_l, tally.records)
-        fan = 1 if self.plain else self.fan
-        split = np.int64(T.UNIT if self.plain else self.split * T.UNIT / fan)
         first, live, total = 0, 0, 0
         tally.scalars[:, T.LAUNCHED] += T.UNIT * np.bincount(paths % T.REPLICATES, minlength=T.REPLICATES)
         while (live or first < len(paths)) and not (stop is not None and stop.is_set()):
@@ -691,7 +685,7 @@ class Tracer:
                 fresh = paths[first : first + self.slots - live]
                 spawn(fresh, self.seed, self.plain, SOBOL, self._rays[live:], self._starts[live:], self._ways[live:])
                 first, live = first + len(fresh), live + len(fresh)
-            self._reserve((1 + self.fan) * live)
+            self._reserve((1 + self._fan) * live)
             starts, ways = self._starts[:live], self._ways[:live]
             prims = self._always[:live] if self._sphere else self._scene.run(starts, ways)
             if self.log is not None:
@@ -699,7 +693,7 @@ class Tracer:
             total += live
             live = advance(
                 live, prims, self._sphere, self._planes, self._centroids, self._horizon, self.eta, self._polarisation,
-                self.reflectance_scale, split, fan, self.max_bounces, T.L_EDGES, self._rays, self._next,
+                self.reflectance_scale, self._split, self._fan, self.max_bounces, T.L_EDGES, self._rays, self._next,
                 self._starts, self._ways, self._block, counters,
             )  # fmt: skip
             self._rays, self._next = self._next, self._rays
