@@ -25,12 +25,13 @@ from tsdf.tally import Tally
 OFFSET = 1e-5  # restart distance along the geometric normal [R], measured: design notes in physics.md §6
 UNKNOWN = 2.0  # horizon of a facet of which nothing is known: no sine exceeds it
 RETRY = 1e-3  # share of the way to the facet's centroid by which a failed restart is moved
+LIGHT = T.UNIT // 16  # light that weighs less is counted one way, as it is or walked backwards, with the weight of both
 NO_OFFSET = 1e-9  # light that leaves this near to where it came in leaves there [R]
 ATOM = 1e-5  # deflections closer than this to 0 or pi are exact for float32 geometry [rad]
 SPLIT = 0.6  # a part lighter than this share of the light that enters is raised to it at random
 FAN = 4  # directions in which a facet is lit from one point, half as many in a grain that shades itself
 OPEN = 0.9  # share of the light that comes in above the horizon of a grain that does not
-SLOTS = 4096  # rays under way at once, per thread, but for splitting: their state stays in the second-level cache
+SLOTS = 2048  # rays under way at once, per thread, but for splitting: their state stays in the second-level cache
 MAX_BOUNCES = 100_000  # default bounce limit
 
 # A ray under way: where it starts and goes, the length inside so far, the light that entered, its random key and path,
@@ -396,13 +397,17 @@ def count_block(count, block, edges, counters):
             mix(np.uint64(path)) & np.uint64(7) == 0
         )  # an eighth of the paths tells the joint distributions well enough
         half, lb = replicate & 1, min(int(length * (BOX_L / T.BOX_LENGTH)), BOX_L - 1)
-        count_offset(cells, c, box, box_l, half, g, lb, boxed, weight, r, z, phi)
-        count_offset(cells, c, box, box_l, half, g, lb, boxed, weight, r_back, z_back, phi_back)
+        forth, back = weight, weight
+        if weight < LIGHT:
+            forth, back = (2 * weight, 0) if key & np.uint64(256) else (0, 2 * weight)
+        if forth > 0:
+            count_offset(cells, c, box, box_l, half, g, lb, boxed, forth, r, z, phi)
+        if back > 0:
+            count_offset(cells, c, box, box_l, half, g, lb, boxed, back, r_back, z_back, phi_back)
         if records.shape[1] > 0:
-            back, back_in = minus(d), minus(d_in)
             keep(records, c, weight, mix(key + np.uint64(0x51)), r, z, phi, length, entry, d_in, d)
             again, exit = mix(key + np.uint64(0x52)), rim(p, d)
-            keep(records, c, weight, again, r_back, z_back, phi_back, length, exit, back, back_in)
+            keep(records, c, weight, again, r_back, z_back, phi_back, length, exit, minus(d), minus(d_in))
 
 
 @njit(cache=True, inline="always")
