@@ -1,4 +1,4 @@
-"""Light meets a surface: Fresnel reflectance, refraction, and the optical constants of the materials.
+"""Light meets a surface: the optical constants that a table is made for, and Fresnel reflectance.
 
 Directions are those of propagation. `eta` is always n_transmitted / n_incident for the hit at hand.
 """

@@ -88,8 +88,8 @@ class Effort:
             raise UsageError(f"the joint records per cell must be 0 to {MAX_JOINT}, got {self.joint}")
         if not (0 <= self.seed < 1 << 63):
             raise UsageError(f"the seed must be 0 to 2^63 - 1, got {self.seed}")
-        if not (1 <= self.max_bounces <= 1 << 31):
-            raise UsageError(f"the bounce limit must be 1 to 2^31, got {self.max_bounces}")
+        if not (1 <= self.max_bounces <= 10**9):
+            raise UsageError(f"the bounce limit must be 1 to 1e9, got {self.max_bounces}")
 
     def resolved(self) -> "Effort":
         """Return the effort with its defaults filled in."""
