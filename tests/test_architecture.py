@@ -15,7 +15,7 @@ ROOT = PACKAGE.parent
 # What each module may import of the package: only what stands below it.
 LAYERS = [
     {"errors"},
-    {"files", "optics", "materials", "table", "tally", "analytic", "exemplars", "surface"},
+    {"files", "optics", "materials", "table", "tally", "analytic", "exemplars", "surface", "sampling", "horizon"},
     {"grains", "format", "estimate"},
     {"tracer", "exact"},
     {"scatterometer", "validate", "plots"},

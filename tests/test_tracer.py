@@ -9,8 +9,10 @@ import pytest
 from tsdf import analytic, estimate
 from tsdf import tally as T
 from tsdf.grains import Grain, embree_scene, first_hit, grain_from_mesh, load_grain
+from tsdf.horizon import horizon_of
+from tsdf.sampling import SOBOL, key_of, sobol, turn
 from tsdf.tally import Tally
-from tsdf.tracer import SOBOL, Tracer, arc, horizon_of, in_order, key_of, sobol, turn
+from tsdf.tracer import Tracer, arc, in_order
 
 
 def traced(grain: Grain, paths: int | np.ndarray, joint: int = 0, eta: float = 1.33, **options: object) -> Tally:

@@ -1,7 +1,8 @@
 """From counts to a table: statistics, their errors, what the cells and the factorisation lose, and the header.
 
 `columns_of` is where fine cells become the columns of a table; `traced_table` makes a `Table` of them, as
-`exact.exact_table` does without counts. Everything is a function of its arguments alone, so equal counts give equal bytes.
+`exact.exact_table` does without counts. Everything is a function of its arguments alone, so equal counts give equal
+bytes.
 """
 
 import math

@@ -21,7 +21,9 @@ from numba import njit
 
 from tsdf import tally as T
 from tsdf.grains import Grain, embree_scene
+from tsdf.horizon import horizon_of
 from tsdf.optics import UNPOLARISED, fresnel
+from tsdf.sampling import SOBOL, coin, key_of, mix, sobol, turn, unit
 from tsdf.tally import Tally
 
 OFFSET = 1e-5  # restart distance along the geometric normal [R]: 1e-7 to 1e-4 leave no self-hits, 1e-3 biases
@@ -51,88 +53,7 @@ COS_THETA, THETA, FORTH, BACK = 0, 1, 2, 5  # r, z, phi_delta follow in the rows
 
 BOX_PHI, BOX_R, BOX_Z, BOX_L = (T.BOX[name] for name in ("phi", "r", "z", "l"))
 
-# Direction numbers of the first four dimensions of Sobol' sequences (Joe & Kuo 2008: s, a, m)
-_JOE_KUO = ((0, 0, ()), (1, 0, (1,)), (2, 1, (1, 3)), (3, 1, (1, 3, 1)))
-
-
-def _direction_numbers() -> np.ndarray:
-    v = np.zeros((4, 32), dtype=np.uint32)
-    for dimension, (s, a, m) in enumerate(_JOE_KUO):
-        numbers = [1] * 32 if s == 0 else list(m)
-        for i in range(len(numbers), 32):
-            new = numbers[i - s] ^ (numbers[i - s] << s)
-            for k in range(1, s):
-                new ^= ((a >> (s - 1 - k)) & 1) * (numbers[i - k] << k)
-            numbers.append(new)
-        v[dimension] = [(number << (31 - i)) & 0xFFFFFFFF for i, number in enumerate(numbers)]
-    return v
-
-
-SOBOL = _direction_numbers()
 GOLDEN_C, GOLDEN_S = math.cos(2.0 * math.pi * 0.6180339887498949), math.sin(2.0 * math.pi * 0.6180339887498949)
-
-
-@njit(cache=True)
-def mix(x):
-    """Return 64 well-mixed bits of a uint64 (the finaliser of SplitMix64, Steele et al. 2014)."""
-    x = np.uint64(x)
-    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return x ^ (x >> np.uint64(31))
-
-
-@njit(cache=True)
-def key_of(seed, a, b):
-    """Return the random key of item (a, b) of a seed, uint64."""
-    k = mix(np.uint64(seed) + np.uint64(0x9E3779B97F4A7C15))
-    k = mix(k ^ (np.uint64(a) * np.uint64(0xD1342543DE82EF95)))
-    return mix(k ^ (np.uint64(b) * np.uint64(0x2545F4914F6CDD1D) + np.uint64(1)))
-
-
-@njit(cache=True)
-def unit(key):
-    """Return a float64 in [0, 1) from a uint64."""
-    return float(np.uint64(key) >> np.uint64(11)) * (1.0 / 9007199254740992.0)
-
-
-@njit(cache=True)
-def coin(path, which):
-    """Return 0 or 1, the same for the whole of a path."""
-    return np.int64(mix(np.uint64(path) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(which)) >> np.uint64(63))
-
-
-@njit(cache=True)
-def reverse_bits(x):
-    """Return a uint32 with its bits in reverse order."""
-    x = np.uint32(x)
-    x = ((x >> np.uint32(1)) & np.uint32(0x55555555)) | ((x & np.uint32(0x55555555)) << np.uint32(1))
-    x = ((x >> np.uint32(2)) & np.uint32(0x33333333)) | ((x & np.uint32(0x33333333)) << np.uint32(2))
-    x = ((x >> np.uint32(4)) & np.uint32(0x0F0F0F0F)) | ((x & np.uint32(0x0F0F0F0F)) << np.uint32(4))
-    x = ((x >> np.uint32(8)) & np.uint32(0x00FF00FF)) | ((x & np.uint32(0x00FF00FF)) << np.uint32(8))
-    return np.uint32((x >> np.uint32(16)) | (x << np.uint32(16)))
-
-
-@njit(cache=True)
-def sobol(index, dimension, scramble, directions):
-    """Return one coordinate of a nested-uniformly (Owen) scrambled Sobol' point, float64 in (0, 1).
-
-    The scramble is the hash of Laine & Karras 2011 in the form of Burley 2020, a different tree for each `scramble`.
-    """
-    x = np.uint32(0)
-    bit = 0
-    while index:
-        if index & 1:
-            x ^= directions[dimension, bit]
-        index >>= 1
-        bit += 1
-    s = np.uint32(scramble)
-    x = reverse_bits(x)
-    x = np.uint32(x ^ np.uint32(x * np.uint32(0x3D20ADEA)))
-    x = np.uint32(x + s)
-    x = np.uint32(x * np.uint32((s >> np.uint32(16)) | np.uint32(1)))
-    x = np.uint32(x ^ np.uint32(x * np.uint32(0x05526C56)))
-    x = np.uint32(x ^ np.uint32(x * np.uint32(0x53A22864)))
-    return (float(reverse_bits(x)) + 0.5) * (1.0 / 4294967296.0)
 
 
 @njit(cache=True)
@@ -180,21 +101,6 @@ def frame(n):
     a = -1.0 / (sign + z)
     b = x * y * a
     return (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
-
-
-@njit(cache=True)
-def turn(u):
-    """Return cosine and sine of 2 pi u, u in [0, 1), to 1e-13, the same on every machine: Taylor series in quarters."""
-    quarter = int(4.0 * u + 0.5)
-    a = (u - 0.25 * quarter) * (2.0 * math.pi)
-    q = a * a
-    c = 1.0 - q / 2.0 * (1.0 - q / 12.0 * (1.0 - q / 30.0 * (1.0 - q / 56.0 * (1.0 - q / 90.0 * (1.0 - q / 132.0)))))
-    s = a * (
-        1.0 - q / 6.0 * (1.0 - q / 20.0 * (1.0 - q / 42.0 * (1.0 - q / 72.0 * (1.0 - q / 110.0 * (1.0 - q / 156.0)))))
-    )
-    if quarter & 1:
-        c, s = -s, c
-    return (-c, -s) if quarter & 2 else (c, s)
 
 
 @njit(cache=True, nogil=True)
@@ -540,70 +446,6 @@ def advance(count, prims, sphere, planes, centroids, horizon, eta, polarisation,
                 live += 1
     count_block(held, block, edges, counters)
     return live
-
-
-@njit(cache=True, nogil=True)
-def _rise(facets, faces, planes, centroids, radii, corner_sines, horizon):
-    """Write into `horizon` a bound on the sine of the elevation of the grain over the `facets` listed."""
-    for i in facets:
-        top = 0.0
-        nx, ny, nz, height = planes[i, 0], planes[i, 1], planes[i, 2], planes[i, 3]
-        for j in range(faces.shape[0]):
-            above = nx * centroids[j, 0] + ny * centroids[j, 1] + nz * centroids[j, 2] - height
-            if above + radii[j] <= 1e-9 or j == i:
-                continue
-            facing = nx * planes[j, 0] + ny * planes[j, 1] + nz * planes[j, 2]
-            tilt = math.sqrt(max(0.0, 1.0 - facing * facing))
-            above += radii[j] * tilt
-            if above <= 1e-9:
-                continue
-            shared, sharp = 0, 1.0
-            for k in range(3):
-                for m in range(3):
-                    if faces[i, k] == faces[j, m]:
-                        shared += 1
-                        sharp = min(sharp, corner_sines[faces[i, k]])
-            if shared == 2:  # across an edge: the neighbour's own slope
-                rise = tilt if facing > 0.0 else 1.0
-            elif shared == 1:  # around a corner, which may be seen from the side
-                rise = tilt / sharp if facing > 0.0 else 1.0
-            else:
-                dx, dy = centroids[j, 0] - centroids[i, 0], centroids[j, 1] - centroids[i, 1]
-                dz = centroids[j, 2] - centroids[i, 2]
-                gap = math.sqrt(dx * dx + dy * dy + dz * dz) - radii[i] - radii[j]
-                rise = above / gap if gap > above else 1.0
-            top = max(top, rise)
-            if top >= 1.0:
-                break
-        horizon[i] = min(top, 1.0)
-
-
-def horizon_of(vertices: np.ndarray, faces: np.ndarray, planes: np.ndarray) -> np.ndarray:
-    """Return for each facet the sine of an elevation above which nothing of the grain stands, (facets,) float64.
-
-    Light above the horizon of a facet reaches it unobstructed and leaves it for good, so it needs no ray. 0 where
-    the whole grain lies behind the facet's plane (every facet of a convex grain); 1 where nothing is promised, as
-    for all facets with something before them if there are so many that looking would take longer than tracing.
-    """
-    from scipy.spatial import ConvexHull
-
-    hull = vertices[ConvexHull(vertices).vertices]
-    horizon = np.ones(len(planes))
-    for start in range(0, len(planes), 1024):
-        part = planes[start : start + 1024]
-        horizon[start : start + 1024][(part[:, :3] @ hull.T).max(axis=1) <= part[:, 3] + 1e-9] = 0.0
-    obstructed = np.flatnonzero(horizon)
-    if 0 < len(obstructed) * len(planes) <= 1e9:
-        corners = vertices[faces]
-        centroids = corners.mean(axis=1)
-        radii = np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
-        sides = np.roll(corners, -1, axis=1) - corners
-        sides /= np.linalg.norm(sides, axis=2)[:, :, None]
-        sines = np.linalg.norm(np.cross(sides, np.roll(sides, 1, axis=1)), axis=2)
-        corner_sines = np.ones(len(vertices))
-        np.minimum.at(corner_sines, faces.ravel(), sines.ravel())
-        _rise(obstructed, faces, planes, centroids, radii, np.maximum(corner_sines, 1e-9), horizon)
-    return horizon
 
 
 def in_order(first: int, last: int) -> np.ndarray:
