@@ -15,8 +15,20 @@ ROOT = PACKAGE.parent
 # What each module may import of the package: only what stands below it.
 LAYERS = [
     {"errors"},
-    {"files", "optics", "materials", "table", "tally", "analytic", "exemplars", "surface", "sampling", "horizon"},
-    {"grains", "format", "estimate"},
+    {
+        "files",
+        "optics",
+        "materials",
+        "table",
+        "tally",
+        "analytic",
+        "exemplars",
+        "surface",
+        "sampling",
+        "vectors",
+        "horizon",
+    },
+    {"grains", "format", "estimate", "horizon"},
     {"tracer", "exact"},
     {"scatterometer", "validate", "plots"},
 ]

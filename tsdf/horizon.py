@@ -5,20 +5,33 @@ import math
 import numpy as np
 from numba import njit
 
+from tsdf.vectors import cross, dot, step, triple
 
-@njit(cache=True, nogil=True)
-def _rise(facets, faces, planes, centroids, radii, corner_sines, horizon):
-    """Write into `horizon` a bound on the sine of the elevation of the grain over the `facets` listed."""
-    for i in facets:
-        top = 0.0
-        nx, ny, nz, height = planes[i, 0], planes[i, 1], planes[i, 2], planes[i, 3]
-        for j in range(faces.shape[0]):
-            above = nx * centroids[j, 0] + ny * centroids[j, 1] + nz * centroids[j, 2] - height
-            if above + radii[j] <= 1e-9 or j == i:
+UNKNOWN = 2.0  # horizon of a facet of which nothing is promised: no sine exceeds it
+
+
+@njit(cache=True)
+def _gap(i, j, corners, axis):
+    """Return how far triangle j lies beyond triangle i along an axis of unit length: no point of them is nearer."""
+    low, high = math.inf, -math.inf
+    for k in range(3):
+        low = min(low, dot(axis, triple(corners[j, k])))
+        high = max(high, dot(axis, triple(corners[i, k])))
+    return low - high
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _rise(obstructed, faces, corners, normals, centroids, radii, corner_sines, horizon):
+    """Write into `horizon` a bound on the sine of the elevation of the grain over the facets listed."""
+    for i in obstructed:
+        top, n = 0.0, triple(normals[i])
+        for j in range(len(faces)):
+            apart = step(triple(centroids[j]), -1.0, triple(centroids[i]))
+            if dot(n, apart) + radii[j] <= 1e-9 or j == i:
                 continue
-            facing = nx * planes[j, 0] + ny * planes[j, 1] + nz * planes[j, 2]
-            tilt = math.sqrt(max(0.0, 1.0 - facing * facing))
-            above += radii[j] * tilt
+            above = -math.inf
+            for k in range(3):
+                above = max(above, dot(n, step(triple(corners[j, k]), -1.0, triple(corners[i, 0]))))
             if above <= 1e-9:
                 continue
             shared, sharp = 0, 1.0
@@ -27,14 +40,22 @@ def _rise(facets, faces, planes, centroids, radii, corner_sines, horizon):
                     if faces[i, k] == faces[j, m]:
                         shared += 1
                         sharp = min(sharp, corner_sines[faces[i, k]])
-            if shared == 2:  # across an edge: the neighbour's own slope
-                rise = tilt if facing > 0.0 else 1.0
-            elif shared == 1:  # around a corner, which may be seen from the side
-                rise = tilt / sharp if facing > 0.0 else 1.0
+            if shared > 0:  # across an edge as steep as the neighbour; around a corner, perhaps seen from the side
+                facing = dot(n, triple(normals[j]))
+                tilt = math.sqrt(max(0.0, 1.0 - facing * facing))
+                rise = (tilt if shared == 2 else tilt / sharp) if facing > 0.0 else 1.0
             else:
-                dx, dy = centroids[j, 0] - centroids[i, 0], centroids[j, 1] - centroids[i, 1]
-                dz = centroids[j, 2] - centroids[i, 2]
-                gap = math.sqrt(dx * dx + dy * dy + dz * dz) - radii[i] - radii[j]
+                distance = math.sqrt(dot(apart, apart))
+                gap = distance - radii[i] - radii[j]
+                if above > top * gap and distance > 0.0:  # it matters: look closer, along the centres and off each side
+                    gap = max(gap, _gap(i, j, corners, step((0.0, 0.0, 0.0), 1.0 / distance, apart)))
+                    for k in range(3):
+                        along = step(triple(corners[i, (k + 1) % 3]), -1.0, triple(corners[i, k]))
+                        off = cross(along, n)
+                        gap = max(gap, _gap(i, j, corners, step((0.0, 0.0, 0.0), 1.0 / math.sqrt(dot(off, off)), off)))
+                        along = step(triple(corners[j, (k + 1) % 3]), -1.0, triple(corners[j, k]))
+                        off = cross(triple(normals[j]), along)
+                        gap = max(gap, _gap(i, j, corners, step((0.0, 0.0, 0.0), 1.0 / math.sqrt(dot(off, off)), off)))
                 rise = above / gap if gap > above else 1.0
             top = max(top, rise)
             if top >= 1.0:
@@ -46,8 +67,8 @@ def horizon_of(vertices: np.ndarray, faces: np.ndarray, planes: np.ndarray) -> n
     """Return for each facet the sine of an elevation above which nothing of the grain stands, (facets,) float64.
 
     Light above the horizon of a facet reaches it unobstructed and leaves it for good, so it needs no ray. 0 where
-    the whole grain lies behind the facet's plane (every facet of a convex grain); 1 where nothing is promised, as
-    for all facets with something before them if there are so many that looking would take longer than tracing.
+    the whole grain lies behind the facet's plane (every facet of a convex grain); UNKNOWN where nothing is promised,
+    as for all facets with something before them if there are so many that looking would take longer than tracing.
     """
     from scipy.spatial import ConvexHull
 
@@ -66,5 +87,7 @@ def horizon_of(vertices: np.ndarray, faces: np.ndarray, planes: np.ndarray) -> n
         sines = np.linalg.norm(np.cross(sides, np.roll(sides, 1, axis=1)), axis=2)
         corner_sines = np.ones(len(vertices))
         np.minimum.at(corner_sines, faces.ravel(), sines.ravel())
-        _rise(obstructed, faces, planes, centroids, radii, np.maximum(corner_sines, 1e-9), horizon)
+        normals = np.ascontiguousarray(planes[:, :3])
+        _rise(obstructed, faces, corners, normals, centroids, radii, np.maximum(corner_sines, 1e-9), horizon)
+    horizon[horizon >= 1.0] = UNKNOWN
     return horizon

@@ -14,6 +14,7 @@ paths may be traced in any order, batch and thread.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from threading import Event
 
 import numpy as np
@@ -21,13 +22,13 @@ from numba import njit
 
 from tsdf import tally as T
 from tsdf.grains import Grain, embree_scene
-from tsdf.horizon import horizon_of
+from tsdf.horizon import UNKNOWN, horizon_of
 from tsdf.optics import UNPOLARISED, fresnel
 from tsdf.sampling import SOBOL, coin, key_of, mix, sobol, turn, unit
 from tsdf.tally import Tally
+from tsdf.vectors import cross, dot, frame, minus, step, triple
 
 OFFSET = 1e-5  # restart distance along the geometric normal [R]: 1e-7 to 1e-4 leave no self-hits, 1e-3 biases
-UNKNOWN = 2.0  # horizon of a facet of which nothing is known: no sine exceeds it
 RETRY = 1e-3  # share of the way to the facet's centroid by which a failed restart is moved
 LIGHT = T.UNIT // 16  # light that weighs less is counted one way, as it is or walked backwards, with the weight of both
 NO_OFFSET = 1e-9  # light that leaves this near to where it came in leaves there [R]
@@ -57,50 +58,10 @@ GOLDEN_C, GOLDEN_S = math.cos(2.0 * math.pi * 0.6180339887498949), math.sin(2.0 
 
 
 @njit(cache=True)
-def dot(a, b):
-    """Return the scalar product of two triples of floats."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@njit(cache=True)
-def cross(a, b):
-    """Return the vector product of two triples of floats."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@njit(cache=True)
-def step(a, t, b):
-    """Return a + t b of two triples of floats."""
-    return a[0] + t * b[0], a[1] + t * b[1], a[2] + t * b[2]
-
-
-@njit(cache=True)
-def minus(a):
-    """Return -a of a triple."""
-    return -a[0], -a[1], -a[2]
-
-
-@njit(cache=True)
 def rim(p, d):
     """Return where light from p along d leaves the bounding sphere."""
     along = dot(p, d)
     return step(p, math.sqrt(max(0.0, along * along + (1.0 - dot(p, p)))) - along, d)
-
-
-@njit(cache=True)
-def triple(v):
-    """Return an array of three as a triple, which the compiler keeps in registers."""
-    return v[0], v[1], v[2]
-
-
-@njit(cache=True)
-def frame(n):
-    """Return two unit vectors that complete a unit vector to a right-handed frame (Duff et al. 2017)."""
-    x, y, z = n
-    sign = math.copysign(1.0, z)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    return (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
 
 
 @njit(cache=True, nogil=True)
@@ -454,6 +415,33 @@ def in_order(first: int, last: int) -> np.ndarray:
     return numbers[np.argsort(numbers % T.REPLICATES, kind="stable")]
 
 
+@lru_cache(maxsize=2)  # the threads of a build share it: the horizon takes about a second to find
+def surface_of(grain: Grain, plain: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return what the kernels ask of a grain's surface; of the exact sphere, one facet that says nothing.
+
+    Returns
+    -------
+    planes : (n, 4) float64
+        Normal and height over the origin of each facet.
+    centroids : (n, 3) float64
+    horizon : (n,) float64
+        See `horizon_of`; nothing is promised if `plain`.
+    share : float
+        Share of the light that comes in above the horizon.
+    """
+    if grain.kind == "sphere":
+        return np.zeros((1, 4)), np.zeros((1, 3)), np.zeros(1), 1.0
+    corners = grain.vertices[grain.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    double_areas = np.linalg.norm(normals, axis=1)
+    normals /= double_areas[:, None]
+    centroids = corners.mean(axis=1)
+    planes = np.column_stack((normals, np.einsum("ij,ij->i", normals, centroids)))
+    horizon = np.full(len(planes), UNKNOWN) if plain else horizon_of(grain.vertices, grain.faces, planes)
+    share = float(np.average(np.maximum(1.0 - horizon**2, 0.0), weights=double_areas))
+    return planes, centroids, horizon, share
+
+
 @dataclass(eq=False)
 class Tracer:
     """One thread's way of tracing a grain: the ray engine, the state of its rays and nothing else.
@@ -487,19 +475,8 @@ class Tracer:
     def __post_init__(self) -> None:
         self._sphere = self.grain.kind == "sphere"
         self._polarisation = {"un": UNPOLARISED, "sp": 3}[self.fresnel]
-        self._planes, self._centroids, self._horizon = np.zeros((1, 4)), np.zeros((1, 3)), np.zeros(1)
-        share = 1.0  # of the light that comes in above the horizon
+        self._planes, self._centroids, self._horizon, share = surface_of(self.grain, self.plain)
         if not self._sphere:
-            corners = self.grain.vertices[self.grain.faces]
-            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            double_areas = np.linalg.norm(normals, axis=1)
-            normals /= double_areas[:, None]
-            self._centroids = corners.mean(axis=1)
-            self._planes = np.column_stack((normals, np.einsum("ij,ij->i", normals, self._centroids)))
-            self._horizon = np.full(len(normals), UNKNOWN)
-            if not self.plain:
-                self._horizon = horizon_of(self.grain.vertices, self.grain.faces, self._planes)
-            share = np.average(np.maximum(1.0 - self._horizon**2, 0.0), weights=double_areas)
             self._scene = embree_scene(self.grain)
         self._fan = 1 if self.plain else FAN if share > OPEN else FAN // 2
         self._split = T.UNIT if self.plain else int(SPLIT * T.UNIT / self._fan)

@@ -1,0 +1,45 @@
+"""Vectors as triples of floats, which the compiler keeps in registers where arrays would cost a reference count."""
+
+import math
+
+from numba import njit
+
+
+@njit(cache=True)
+def dot(a, b):
+    """Return the scalar product of two triples of floats."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True)
+def cross(a, b):
+    """Return the vector product of two triples of floats."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@njit(cache=True)
+def step(a, t, b):
+    """Return a + t b of two triples of floats."""
+    return a[0] + t * b[0], a[1] + t * b[1], a[2] + t * b[2]
+
+
+@njit(cache=True)
+def minus(a):
+    """Return -a of a triple."""
+    return -a[0], -a[1], -a[2]
+
+
+@njit(cache=True)
+def triple(v):
+    """Return an array of three as a triple, which the compiler keeps in registers."""
+    return v[0], v[1], v[2]
+
+
+@njit(cache=True)
+def frame(n):
+    """Return two unit vectors that complete a unit vector to a right-handed frame (Duff et al. 2017)."""
+    x, y, z = n
+    sign = math.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
