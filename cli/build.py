@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tsdf.cli.common import Tool
-from tsdf.errors import TSDFError, UsageError
+from tsdf.errors import GrainError, TSDFError, UsageError
 
 if TYPE_CHECKING:
     from tsdf.scatterometer import Build, Progress
@@ -48,7 +48,7 @@ def _part(context: click.Context, parameter: click.Parameter, value: str | None)
     if value is None:
         return None
     first, slash, second = value.partition("/")
-    if slash and first.isdigit() and second.isdigit() and 1 <= int(first) <= int(second):
+    if slash and value.isascii() and first.isdecimal() and second.isdecimal() and 1 <= int(first) <= int(second):
         return int(first), int(second)
     raise click.BadParameter(f"{value!r} is not i/n with 1 <= i <= n", context, parameter)
 
@@ -63,8 +63,8 @@ def _setting(context: click.Context, parameter: click.Parameter, values: tuple[s
     return settings
 
 
-def check_output(out: Path) -> None:
-    """Refuse an output that cannot be written before any work is done for it.
+def check_output(out: Path, *inputs: Path) -> None:
+    """Refuse an output that cannot be written, or would replace an input, before any work is done for it.
 
     Raises
     ------
@@ -74,6 +74,8 @@ def check_output(out: Path) -> None:
         raise TSDFError(f"cannot write {out}: {out.parent} is not a folder; make it, or choose another --out")
     if out.exists() and not out.is_file():
         raise TSDFError(f"cannot write {out}: it is not a regular file; choose another --out")
+    if out.exists() and any(path.exists() and path.samefile(out) for path in inputs):
+        raise TSDFError(f"cannot write {out}: it is an input; choose another --out")
     if not os.access(out.parent, os.W_OK):
         raise TSDFError(f"cannot write {out}: no permission in {out.parent}; choose another --out")
 
@@ -205,14 +207,18 @@ def main(
     if eta is None:
         from tsdf.materials import optical_constants
 
-        found = optical_constants(material or DEFAULT_MATERIAL, wavelength_nm or DEFAULT_WAVELENGTH_NM)
+        found = optical_constants(
+            material or DEFAULT_MATERIAL, DEFAULT_WAVELENGTH_NM if wavelength_nm is None else wavelength_nm
+        )
         optics = Optics(found.n, fresnel, found.material, found.wavelength_nm, found.k, found.source)
     else:
         optics = Optics(eta, fresnel)
     effort = scatterometer.Effort(paths, target_error, cells, joint, seed, max_bounces)
-    check_output(out)
+    check_output(out, Path(grain))
     part_file = out if part is not None else out.with_name(out.name + ".part")
     if not exact and part_file.exists() and not resume:
+        if part is not None:
+            raise TSDFError(f"{part_file} exists already: add --resume to go on with it, or choose another --out")
         raise TSDFError(f"{part_file} holds an unfinished build: add --resume to go on with it, or delete it")
 
     from tsdf.grains import load_grain
@@ -232,12 +238,17 @@ def main(
             differing = ", ".join(key for key in build.request if build.request[key] != stored.request.get(key))
             raise TSDFError(f"{part_file} is of another build (they differ in {differing}): delete it to start anew")
         build = stored
-    _run(build, shape, threads or os.cpu_count() or 1, part, part_file, quiet)
+    try:
+        _run(build, shape, threads or os.cpu_count() or 1, part, part_file, quiet)
+        table = build.table() if part is None else None
+    except (GrainError, UsageError):
+        part_file.unlink(missing_ok=True)  # a refused build cannot be gone on with
+        raise
     if part is not None:
         if not quiet:
             click.echo(f"{out}: part {part[0]} of {part[1]}, {build.paths} paths; tsdf-merge makes the table")
         return
-    finish(build.table(), out, quiet)
+    finish(table, out, quiet)
     part_file.unlink(missing_ok=True)
 
 
@@ -270,9 +281,13 @@ def finish(table: Any, out: Path, quiet: bool) -> None:
     from tsdf.format import write
 
     write(table, out)
+    ledger = table.header["energy_ledger"]
+    leak = (ledger["lost"] + ledger["truncated"]) / ledger["launched"]
+    if leak > 1e-6:
+        click.echo(f"warning: {leak:.1e} of the light was lost or cut off: see energy in tsdf-info", err=True)
     if quiet:
         return
-    s, errors, ledger = table.statistics, table.header["standard_errors"], table.header["energy_ledger"]
+    s, errors = table.statistics, table.header["standard_errors"]
     error = table.header["table_error"]
     click.echo(f"{out}: {table.header['grain']['name']}, eta {table.header['optics']['eta']:.6g}")
     for label, name in (
@@ -289,7 +304,4 @@ def finish(table: Any, out: Path, quiet: bool) -> None:
         f"  {'total variation to the truth, about':40s}{error['total_variation']:.2g} "
         f"(noise {error['sampling_noise']:.2g}, cells {error['cell_width']:.2g})"
     )
-    leak = (ledger["lost"] + ledger["truncated"]) / ledger["launched"]
     click.echo(f"  {'light lost or cut off':40s}{leak:.1e}")
-    if leak > 1e-6:
-        click.echo(f"warning: {leak:.1e} of the light was lost or cut off: see energy_ledger in tsdf-info", err=True)

@@ -16,5 +16,5 @@ def main(parts: tuple[Path, ...], out: Path, quiet: bool) -> None:
     """Merge the PARTS that tsdf-build --chunk i/n wrote, in any order, into one table."""
     from tsdf.scatterometer import merge
 
-    check_output(out)
+    check_output(out, *parts)
     finish(merge(list(parts)).table(), out, quiet)

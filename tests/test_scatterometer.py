@@ -129,7 +129,7 @@ def test_damaged_part_files_are_refused(octahedron: Grain, tmp_path: Path) -> No
     rng = np.random.default_rng(0)
     for cut in (0, 10, len(data) // 2, len(data) - 1):
         part.write_bytes(data[:cut])
-        with pytest.raises(TSDFError, match="not a usable part file"):
+        with pytest.raises(TSDFError, match="not a whole part file"):
             Build.load(part)
     for place in rng.integers(0, len(data), 20):
         damaged = bytearray(data)

@@ -101,6 +101,7 @@ def jackknife(sums: np.ndarray, statistic: Callable[[np.ndarray], np.ndarray]) -
     statistic : callable
         From (..., n) sums to (..., m) values; may be a ratio.
     """
+    sums = sums.astype(np.float64)  # sums over replicates may pass 2^63
     total = sums.sum(axis=0)
     left_out = statistic(total - sums)
     spread = ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0)
@@ -334,11 +335,14 @@ def systematic(weights: np.ndarray, count: int) -> np.ndarray:
     )
 
 
+ENTRY_B2 = 2 + RECORD_FIELDS.index("entry_b2")  # column of a record; the first two are key and weight
+
+
 def records_of(tally: Tally, cells: int) -> np.ndarray:
     """Return `tally.joint` equally likely records per column, (fields, joint, cells + 2), by ascending entry_b2.
 
-    The reservoirs of the coarse cells in a column are one reservoir; one that is not full holds everything there was,
-    with its weight.
+    The reservoirs of the coarse cells in a column are one reservoir, a priority sample of all its light (Duffield, Lund
+    & Thorup 2007), from which `joint` records are drawn in proportion to what each stands for.
     """
     count = tally.joint
     result = np.zeros((len(RECORD_FIELDS), count, cells + 2))
@@ -351,13 +355,12 @@ def records_of(tally: Tally, cells: int) -> np.ndarray:
         rows = rows[np.isfinite(rows[:, 0])]
         if len(rows) == 0:
             continue
-        if len(rows) >= count:
-            rows = rows[np.lexsort(rows.T[::-1])[:count]]
-            rows = rows[np.lexsort(rows[:, 2:].T[::-1][[1, 0, 2, 3, 4, 5]])]
-        else:
-            rows = rows[np.lexsort(rows[:, 2:].T[::-1][[1, 0, 2, 3, 4, 5]])]
-            rows = rows[systematic(rows[:, 1], count)]
-        rows = rows[np.argsort(rows[:, 6], kind="stable")]
+        rows = rows[np.lexsort(rows.T[::-1])]  # by key, and by the rest where keys are equal
+        weights = rows[:, 1]
+        if len(rows) > count:  # a priority sample: each stands for its weight, or for the threshold if that is more
+            weights, rows = np.maximum(weights, 1.0 / rows[count, 0])[:count], rows[:count]
+        order = np.argsort(rows[:, ENTRY_B2], kind="stable")
+        rows = rows[order[systematic(weights[order], count)]]
         result[:, :, column] = rows[:, 2:].T
     result[2] = np.where(result[2] <= -math.pi, math.pi, result[2])
     result[5] = np.where(result[5] <= -math.pi, math.pi, result[5])

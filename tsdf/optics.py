@@ -1,6 +1,7 @@
 """Light meets a surface: the optical constants that a table is made for, and Fresnel reflectance.
 
-Directions are those of propagation. `eta` is always n_transmitted / n_incident for the hit at hand.
+Directions are those of propagation. `Optics.eta` is that of the grain, n_inside / n_outside; `fresnel` takes that of
+the hit at hand, n_transmitted / n_incident.
 """
 
 import math

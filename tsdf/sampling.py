@@ -52,12 +52,6 @@ def unit(key):
 
 
 @njit(cache=True)
-def coin(path, which):
-    """Return 0 or 1, the same for the whole of a path."""
-    return np.int64(mix(np.uint64(path) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(which)) >> np.uint64(63))
-
-
-@njit(cache=True)
 def reverse_bits(x):
     """Return a uint32 with its bits in reverse order."""
     x = np.uint32(x)
@@ -72,7 +66,8 @@ def reverse_bits(x):
 def sobol(index, dimension, scramble, directions):
     """Return one coordinate of a nested-uniformly (Owen) scrambled Sobol' point, float64 in (0, 1).
 
-    The scramble is the hash of Laine & Karras 2011 in the form of Burley 2020, a different tree for each `scramble`.
+    The scramble is a hash in the manner of Laine & Karras 2011 with the constants of Vegdahl 2021, a different tree for
+    each `scramble`.
     """
     x = np.uint32(0)
     bit = 0

@@ -8,6 +8,7 @@ or not, in one piece or in parts merged afterwards. After each chunk the counts 
 import io
 import json
 import math
+import shlex
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -31,7 +32,7 @@ from tsdf.tracer import MAX_BOUNCES, Tracer, in_order
 DEFAULT_PATHS = 4_000_000
 DEFAULT_CELLS = 256
 MIN_PATHS = 16 * T.REPLICATES  # fewer give no honest standard error
-MAX_PATHS = 1 << 36  # 6.9e10: the counts stay below 2^63
+MAX_PATHS = 1 << 36  # 6.9e10: 2^30 in each replicate, whose energy times path length stays below 2^63
 MAX_JOINT = 1024
 MAX_LEAK = 1e-4  # share of the light that may be lost or cut off before a grain is refused
 CHUNK_MIN, CHUNK_MAX = 1 << 13, 1 << 20
@@ -130,10 +131,11 @@ def grain_header(grain: Grain) -> dict[str, Any]:
 
 def canonical_command(grain: Mapping[str, Any], optics: Optics, effort: Effort, traced: bool) -> str:
     """Return the command that makes the same table: no paths of this machine, no threads, no chunks."""
-    words = ["tsdf-build", grain["name"]]
+    words = ["tsdf-build", shlex.quote(grain["name"])]
+    words += ["--repair"] if any(note.startswith("repair") for note in grain["notes"]) else []
     words += [f"--set {key}={value}" for key, value in grain["parameters"].items()]
     if optics.material is not None:
-        words += [f"--material {optics.material}", f"--wavelength-nm {optics.wavelength_nm:g}"]
+        words += [f"--material {optics.material}", f"--wavelength-nm {optics.wavelength_nm!r}"]
     else:
         words += [f"--eta {optics.eta!r}"]
     words += [f"--fresnel {optics.fresnel}"] if grain["kind"] == "sphere" else []
@@ -264,7 +266,7 @@ class Build:
             raise UsageError(
                 f"--target-error {target:g} is out of reach: {finest.cells} cells of theta alone cost "
                 f"{finest.cell_width:.2g} of total variation; "
-                + ("allow more --cells" if self.effort.cells else "ask for more")
+                + ("allow more --cells" if self.effort.cells else "give a larger --target-error, or --paths")
             )
         return False
 
@@ -310,7 +312,11 @@ class Build:
         tracers[0].trace(in_order(0, T.REPLICATES), tallies[0])  # compiles what is not compiled yet
         tallies[0].clear()
         stop = threading.Event()
-        progress = Progress(self.paths, 0, self.effort.paths)
+        numbered = enumerate(chunks(self.effort.paths)) if self.effort.paths is not None else ()
+        mine = sum(last - first for k, (first, last) in numbered if k % part[1] == part[0] - 1)
+        progress = Progress(self.paths, 0, mine or None)
+        if part_file is not None and mine == 0 and self.effort.paths is not None:
+            self.save(part_file)  # more parts than chunks: this one is empty, but there
         if report is not None:
             progress.error = self._shown_error(progress)
             report(progress)
@@ -331,15 +337,15 @@ class Build:
                         self.tally.add(tally)
                         tally.clear()
                     self.done.add(k)
-                    progress.paths += last - first
                     if part_file is not None:
                         self.save(part_file)
+                    progress.paths += last - first
                     error = self.error() if report is not None or self.effort.target_error is not None else None
                     if report is not None:
                         progress.error = error.total_variation if error else None
                         progress.cells = error.cells if error else None
                         report(progress)
-                    self.check_leaks()
+                    self.check_leaks(doubt=4.0)
                     if self.met(error):
                         return
             except BaseException:
@@ -347,7 +353,7 @@ class Build:
                 raise
         if self.effort.target_error is not None:
             raise TSDFError(
-                f"--target-error {self.effort.target_error:g} was not met after {MAX_PATHS:.2g} paths: ask for more"
+                f"--target-error {self.effort.target_error:g} was not met after {MAX_PATHS:.2g} paths: give more"
             )
 
     def _shown_error(self, progress: Progress) -> float | None:
@@ -355,18 +361,22 @@ class Build:
         progress.cells = error.cells if error else None
         return error.total_variation if error else None
 
-    def check_leaks(self) -> None:
+    def check_leaks(self, doubt: float = 0.0) -> None:
         """Refuse a grain whose tracing loses too much light.
+
+        Parameters
+        ----------
+        doubt : float
+            Standard errors, of rare whole paths, by which it must be too much.
 
         Raises
         ------
         GrainError
-            If more than MAX_LEAK of the light was lost at the surface or cut off by the bounce limit.
+            If more than MAX_LEAK of the light launched was lost at the surface or cut off by the bounce limit.
         """
         sums = self.tally.scalars.astype(object).sum(axis=0)
         launched, lost, cut = sums[T.LAUNCHED], sums[T.LOST], sums[T.TRUNCATED]
-        doubt = 4.0 * math.sqrt(MAX_LEAK * launched / T.UNIT) * T.UNIT  # four standard errors of rare whole paths
-        limit = MAX_LEAK * launched + doubt
+        limit = MAX_LEAK * launched + doubt * math.sqrt(MAX_LEAK * launched / T.UNIT) * T.UNIT
         if lost > limit:
             raise GrainError(
                 f"{self.grain['name']}: {lost / launched:.2g} of the light was lost at the surface, more than "
@@ -393,11 +403,9 @@ class Build:
                     f"{len(missing)} of {len(missing) + len(self.done)} chunks are missing: give all the parts"
                 )
         self.check_leaks()
-        cells = self.effort.cells
-        if cells is None:
-            error = self.error()
-            assert error is not None
-            cells = error.cells
+        error = self.error()
+        if error is None or (self.effort.target_error is not None and not self.met(error)):
+            raise TSDFError("the target error is not met yet: go on with --resume")
         provenance = {
             "method": "traced",
             "command": canonical_command(self.grain, self.optics, self.effort, traced=True),
@@ -405,7 +413,7 @@ class Build:
             "paths": self.paths,
             "max_bounces": self.effort.max_bounces,
         }
-        return estimate.traced_table(self.tally, cells, self.grain, self.optics, provenance)
+        return estimate.traced_table(self.tally, error.cells, self.grain, self.optics, provenance)
 
     def save(self, path: Path) -> None:
         """Write the part file, atomically.
@@ -452,12 +460,13 @@ class Build:
                 mine[...] = arrays[name]
         except FileNotFoundError:
             raise TSDFError(f"{path}: no such file") from None
+        except OSError as error:
+            raise TSDFError(f"{path}: {error.strerror or error}") from None
         except TSDFError:
             raise
         except Exception as error:  # whatever zip, npy and json readers make of a damaged file
-            raise TSDFError(
-                f"{path}: not a usable part file ({type(error).__name__}): delete it and build again"
-            ) from None
+            reason = "not a whole part file of tsdf-build --chunk or of an interrupted build"
+            raise TSDFError(f"{path}: {reason}: give another, or build this part again") from error
         return build
 
 

@@ -74,13 +74,14 @@ class Tally:
         Energy by deflection.
     cells : (COARSE + 2, PHI + R + Z + 2 L) int64
         The conditionals side by side, `phi`, `r`, `z`, `l` and `l_sum`: energy by phi_Delta, r, z and path length,
-        and energy times path length. Every path counts twice in the first three, as it is and reversed.
+        and energy times path length. In the first three all energy counts twice, as it is and reversed;
+        little of it counts one way at random, with the weight of both.
     box : (2, GROUPS + 2, 8, 16, 16) int64
-        Energy by (phi, r, z), for the even and the odd replicates.
+        Energy by (phi, r, z) of one path in eight, as it is and reversed, for the even and the odd replicates.
     box_l : (2, GROUPS + 2, 16, 8 + 16 + 16) int64
-        Energy by path length and each of phi, r, z.
-    records : (COARSE + 2, joint, RECORD) float64
-        Bottom-k samples: the records with the smallest keys -ln(u) / weight, in no order.
+        Energy by path length and each of phi, r, z, of the same paths.
+    records : (COARSE + 2, joint + 1, RECORD) float64
+        Priority samples (Duffield, Lund & Thorup 2007): the records of the smallest keys u / weight, in no order.
     """
 
     joint: int = 0
@@ -95,7 +96,7 @@ class Tally:
 
     def __post_init__(self) -> None:
         if self.records.size == 0:
-            self.records = np.full((COARSE + 2, self.joint, RECORD), np.inf)
+            self.records = np.full((COARSE + 2, self.joint + 1 if self.joint else 0, RECORD), np.inf)
 
     def conditional(self, name: str) -> np.ndarray:
         """Return "phi", "r", "z", "l" or "l_sum", (COARSE + 2, cells) int64, a view."""
@@ -119,7 +120,7 @@ class Tally:
                 mine += getattr(other, name)
         if self.joint:
             both = np.concatenate((self.records, other.records), axis=1)
-            self.records = smallest(both, self.joint)
+            self.records = smallest(both, self.joint + 1)
 
     def clear(self) -> None:
         """Forget everything."""

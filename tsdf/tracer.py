@@ -24,7 +24,7 @@ from tsdf import tally as T
 from tsdf.grains import Grain, embree_scene
 from tsdf.horizon import UNKNOWN, horizon_of
 from tsdf.optics import UNPOLARISED, fresnel
-from tsdf.sampling import SOBOL, coin, key_of, mix, sobol, turn, unit
+from tsdf.sampling import SOBOL, key_of, mix, sobol, turn, unit
 from tsdf.tally import Tally
 from tsdf.vectors import cross, dot, frame, minus, step, triple
 
@@ -45,7 +45,8 @@ RAY = np.dtype(
     [("p", "3f8"), ("d", "3f8"), ("entry", "3f8"), ("d_in", "3f8"), ("length", "f8"), ("key", "u8"), ("path", "i8"),
      ("weight", "i4"), ("facet", "i4"), ("hits", "i4"), ("flags", "i4")]
 )  # fmt: skip
-INSIDE, RETRIED, MET = 1, 2, 4
+INSIDE, RETRIED, MET, P_POLARISED = 1, 2, 4, 8
+OTHER = np.uint64(0xA5A5A5A5A5A5A5A5)  # turns a random key into that of the other branch
 
 # Light that leaves is counted in blocks. Rows of `left`: where it starts for the rim, its direction, where the light
 # entered, its direction, the length inside (13); of `notes`: weight, path, key; of `found`, see `measure`:
@@ -89,7 +90,8 @@ def spawn(paths, seed, plain, directions, rays, starts, ways):
         radius = math.sqrt(u2)
         c, s = turn(u3)
         entry = step(step(step((0.0, 0.0, 0.0), radius * c, t), radius * s, b), -math.sqrt(1.0 - u2), d)
-        start(i, rays, starts, ways, entry, entry, d, entry, d, 0.0, T.UNIT, key_of(seed, path, 1), -1, 0, 0, path)
+        side = P_POLARISED if key_of(seed, path, 2) & np.uint64(1) else 0
+        start(i, rays, starts, ways, entry, entry, d, entry, d, 0.0, T.UNIT, key_of(seed, path, 1), -1, side, 0, path)
 
 
 @njit(cache=True, inline="always")
@@ -141,13 +143,11 @@ def arc(y, x):
 def keep(records, c, weight, key, r, z, phi, length, p, d, out):
     """Offer the record of light that enters at p along d and leaves along `out` to the reservoir of cell `c`.
 
-    It stays if its key -ln(u) / weight is among the smallest.
+    It stays if its key u / weight is among the smallest.
     """
     last = records.shape[1] - 1  # the largest key stands last
-    share, u = weight / T.UNIT, unit(key)
-    if u / share >= records[c, last, 0]:  # u <= -ln(1 - u), and the logarithm is dear
-        return
-    value = -math.log(1.0 - u) / share
+    share = weight / T.UNIT
+    value = (1.0 - unit(key)) / share
     if value >= records[c, last, 0]:
         return
     side = step(p, -dot(p, d), d)
@@ -273,10 +273,11 @@ def count_block(count, block, edges, counters):
             count_offset(cells, c, box, box_l, half, g, lb, boxed, forth, r, z, phi)
         if back > 0:
             count_offset(cells, c, box, box_l, half, g, lb, boxed, back, r_back, z_back, phi_back)
-        if records.shape[1] > 0:
-            keep(records, c, weight, mix(key + np.uint64(0x51)), r, z, phi, length, entry, d_in, d)
+        if records.shape[1] > 0 and forth > 0:
+            keep(records, c, forth, mix(key + np.uint64(0x51)), r, z, phi, length, entry, d_in, d)
+        if records.shape[1] > 0 and back > 0:
             again, exit = mix(key + np.uint64(0x52)), rim(p, d)
-            keep(records, c, weight, again, r_back, z_back, phi_back, length, exit, minus(d), minus(d_in))
+            keep(records, c, back, again, r_back, z_back, phi_back, length, exit, minus(d), minus(d_in))
 
 
 @njit(cache=True, inline="always")
@@ -303,7 +304,7 @@ def advance(count, prims, sphere, planes, centroids, horizon, eta, polarisation,
         ray, facet = rays[i], prims[i]
         p, d, entry, d_in = triple(ray.p), triple(ray.d), triple(ray.entry), triple(ray.d_in)
         length, path, key, weight = ray.length, ray.path, ray.key, np.int64(ray.weight)
-        inside, met = (ray.flags & INSIDE) != 0, (ray.flags & MET) != 0
+        inside, met, side = (ray.flags & INSIDE) != 0, (ray.flags & MET) != 0, ray.flags & P_POLARISED
         replicate = path % T.REPLICATES
 
         if facet < 0 and not inside:
@@ -374,7 +375,7 @@ def advance(count, prims, sphere, planes, centroids, horizon, eta, polarisation,
             # Reflection and refraction; one of the two goes on outside (out), the other inside (into)
             ratio = 1.0 / eta if inside else eta
             cos_i = min(abs(cosine), 1.0)
-            reflectance, cos_t = fresnel(cos_i, ratio, polarisation if polarisation < 3 else 1 + coin(path, 5))
+            reflectance, cos_t = fresnel(cos_i, ratio, polarisation if polarisation < 3 else (2 if side else 1))
             total = reflectance >= 1.0
             if not total:
                 reflectance = min(reflectance * reflectance_scale, 1.0)
@@ -399,11 +400,11 @@ def advance(count, prims, sphere, planes, centroids, horizon, eta, polarisation,
                     held += 1
                 else:
                     start(live, next_rays, starts, ways, p, step(p, OFFSET, n), out, entry, d_in, length,
-                          out_weight, mix(key ^ np.uint64(0xA5A5A5A5A5A5A5A5)), facet, MET, hits, path)  # fmt: skip
+                          out_weight, mix(key ^ OTHER), facet, MET | side, hits, path)  # fmt: skip
                     live += 1
             if out_weight < weight:
                 start(live, next_rays, starts, ways, p, step(p, -OFFSET, n), into, entry, d_in, length,
-                      weight - out_weight, key, facet, MET | INSIDE, hits, path)  # fmt: skip
+                      weight - out_weight, key, facet, MET | INSIDE | side, hits, path)  # fmt: skip
                 live += 1
     count_block(held, block, edges, counters)
     return live

@@ -28,10 +28,10 @@ CODES = {
     "STATISTICS_METHOD": ("error", "an exact table is of a sphere and of 0 paths, a traced one of some"),
     "STATISTICS_LOSSLESS": ("error", "nothing was absorbed"),
     "STATISTICS_LEDGER": ("error", "hit_probability and albedo are those of the energy ledger within 1e-8"),
-    "STATISTICS_DROPPED": ("warning", "at most 1e-6 of the light that met the grain was truncated or lost"),
+    "STATISTICS_DROPPED": ("warning", "at most 1e-6 of the light launched was truncated or lost"),
     "STATISTICS_DROPPED_MUCH": (
         "error",
-        "at most 1e-4 of the light that met the grain was truncated or lost",
+        "at most 1e-4 of the light launched was truncated or lost",
     ),
     "STATISTICS_STANDARD_ERRORS": (
         "error",
@@ -76,6 +76,8 @@ CODES = {
     "PHYSICS_RECIPROCITY": ("error", "joint records agree with their reversed paths: mean z is that of both"),
 }
 WAYS_OUT = {
+    "STATISTICS_DROPPED": "trace more paths to be sure; mend the mesh, or raise --max-bounces",
+    "STATISTICS_DROPPED_MUCH": "mend the mesh, or raise --max-bounces",
     "STATISTICS": "header and pixels do not belong together, build the table again",
     "PHYSICS": "the table does not show this grain at this eta, build it again or report the tracer",
 }
@@ -199,7 +201,7 @@ class _Judge:
     def require(self, ok: Any, code: str, pointer: str, message: str) -> bool:
         self.checks += 1
         if not ok:
-            text = f"{message}; {WAYS_OUT[code.partition('_')[0]]}"
+            text = f"{message}; {WAYS_OUT.get(code) or WAYS_OUT[code.partition('_')[0]]}"
             self.findings.append(Finding(code, CODES[code][0], pointer, text))
         return bool(ok)
 
@@ -323,10 +325,12 @@ def _statistics(gavel: _Judge, t: _Subject) -> None:
         if gavel.require(whole > 0, "STATISTICS_LEDGER", "/energy_ledger", f"{name} has no light to be the share of"):
             pointer = f"/statistics/{name}"
             gavel.near("STATISTICS_LEDGER", pointer, name, s[name], part / whole, LEDGER_ROUNDING)
-    code = "STATISTICS_DROPPED_MUCH" if t.dropped > DROPPED_MUCH else "STATISTICS_DROPPED"
-    limit = DROPPED_MUCH if t.dropped > DROPPED_MUCH else DROPPED
+    ledger = t.header["energy_ledger"]
+    dropped = (ledger["truncated"] + ledger["lost"]) / ledger["launched"] if ledger["launched"] else 0.0
+    code = "STATISTICS_DROPPED_MUCH" if dropped > DROPPED_MUCH else "STATISTICS_DROPPED"
+    limit = DROPPED_MUCH if dropped > DROPPED_MUCH else DROPPED
     what = "the share of light truncated or lost"
-    gavel.within(code, "/energy_ledger", what, t.dropped, 0.0, limit)
+    gavel.within(code, "/energy_ledger", what, dropped, 0.0, limit)
 
     _stated_errors(gavel, t)
     for name, column in (("atom_backward", 0), ("atom_forward", -1)):
