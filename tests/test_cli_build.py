@@ -202,3 +202,52 @@ def test_open_mesh_and_repair(tmp_path: Path) -> None:
     result = run(tmp_path / "open.obj", *words, "--out", tmp_path / "x.exr")
     assert result.exit_code == 0 and "note: repair" in result.stderr
     assert any("repair" in note for note in tsdf.read(tmp_path / "x.exr").header["grain"]["notes"])
+
+
+def test_inputs_are_not_overwritten(tmp_path: Path) -> None:
+    part = tmp_path / "1.part"
+    assert run("cube", *FAST, "--chunk", "1/1", "--out", part).exit_code == 0
+    kept = part.read_bytes()
+    result = CliRunner().invoke(merge, [str(part), "--out", str(part)])
+    assert result.exit_code == 1 and "is an input" in one_line(result)
+    assert part.read_bytes() == kept
+    mesh = tmp_path / "m.obj"
+    mesh.write_text("v 0 0 0")
+    result = run(mesh, *FAST, "--out", mesh)
+    assert result.exit_code == 1 and "is an input" in one_line(result)
+    assert mesh.read_text() == "v 0 0 0"
+
+
+def test_more_parts_than_chunks(tmp_path: Path) -> None:
+    """A job array may be larger than the work: its idle jobs leave parts that merge like the others."""
+    words = ["cube", "--eta", "1.31", "--paths", "8192", "--quiet"]
+    parts = [str(tmp_path / f"{i}.part") for i in (1, 2, 3)]
+    for i, part in enumerate(parts, 1):
+        assert run(*words, "--chunk", f"{i}/3", "--out", part).exit_code == 0
+    result = CliRunner().invoke(merge, [*parts, "--out", str(tmp_path / "m.exr"), "--quiet"])
+    assert result.exit_code == 0
+    assert run(*words, "--out", tmp_path / "w.exr").exit_code == 0
+    assert (tmp_path / "m.exr").read_bytes() == (tmp_path / "w.exr").read_bytes()
+
+
+def test_refused_builds_leave_nothing_in_the_way(tmp_path: Path) -> None:
+    out = tmp_path / "x.exr"
+    result = run("icosphere", "--eta", "1.5", "--paths", "20000", "--max-bounces", "2", "--quiet", "--out", out)
+    assert result.exit_code == 1 and "raise --max-bounces" in one_line(result)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unfinished_target_is_no_table(tmp_path: Path) -> None:
+    from tsdf.grains import load_grain
+    from tsdf.optics import Optics
+    from tsdf.scatterometer import Build, Effort
+
+    grain = load_grain("cube")
+    whole = Build.start(grain, Optics(1.31), Effort(target_error=0.02))
+    whole.run(grain, part_file=tmp_path / "x.part")
+    unfinished = Build.start(grain, Optics(1.31), Effort(target_error=0.001))
+    unfinished.tally, unfinished.done = whole.tally, whole.done
+    unfinished.save(tmp_path / "y.part")
+    result = CliRunner().invoke(merge, [str(tmp_path / "y.part"), "--out", str(tmp_path / "y.exr")])
+    assert result.exit_code == 1 and "not met" in one_line(result)
+    assert not (tmp_path / "y.exr").exists()
