@@ -64,7 +64,7 @@ def refused(message, *args, **kwargs):
     ],
 )
 def test_cauchy(name, given, hit_probability):
-    """Convex grains: beta = S / (4 pi R²), values of physics.md section 4."""
+    """Convex grains: beta = S / (4 pi R²), values of the closed forms."""
     grain = load_grain(name, **given)
     assert grain.area / (4 * np.pi) == pytest.approx(hit_probability, abs=6e-7)
     assert grain.convex and grain.bodies == 1 and grain.notes == ()
