@@ -274,8 +274,8 @@ def test_exact_table_is_the_exact_sphere(fresnel: str) -> None:
     assert (table.joint["z"] @ weight).sum() == pytest.approx(truth.mean_z, abs=1e-3)
 
 
-# Convex solids inscribed in R = 1, Fresnel averaged, lossless: another program's 4e6 rays each. Its errors are of the mean
-# cosine; those of <z> and <r> are not stated and taken to be as large.
+# Convex solids inscribed in R = 1, Fresnel averaged, lossless: another program's 4e6 rays each. Its errors are of the
+# mean cosine; those of <z> and <r> are not stated and taken to be as large.
 SOLIDS = [
     ("hexprism", {"aspect": 1.0}, 1.31, (0.684213, 0.83191), (0.54237, 1.47024, 0.65206), 0.00033, 0.24),
     ("hexprism", {"aspect": 0.2}, 1.31, (0.581233, 1.00020), (0.74639, 1.51898, 0.43628), 0.00030, 0.55),
@@ -331,8 +331,8 @@ def test_icospheres_converge_to_the_sphere() -> None:
     """The total variation of the density falls as the root of the number of faces, first order in the edge length.
 
     In 1024 cells, where it is that of the density; coarser cells average over the facets and make it fall faster. The
-    figures of another program (.107, .053, .025 for 320, 1280, 5120 faces) are of cells it does not name; 256 uniform in
-    cos theta give .134, .050, .025.
+    figures of another program (.107, .053, .025 for 320, 1280, 5120 faces) are of cells it does not name; 256 uniform
+    in cos theta give .134, .050, .025.
     """
     variations = []
     for subdivisions in (2, 3, 4):
