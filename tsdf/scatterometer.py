@@ -179,6 +179,11 @@ class Progress:
     error: float | None = None
     cells: int | None = None
 
+    def at(self, error: estimate.TableError | None) -> "Progress":
+        """Take note of the error reached and return self."""
+        self.error, self.cells = (error.total_variation, error.cells) if error else (None, None)
+        return self
+
 
 @dataclass(eq=False)
 class Build:
@@ -317,10 +322,10 @@ class Build:
         progress = Progress(self.paths, 0, mine or None)
         if part_file is not None and mine == 0 and self.effort.paths is not None:
             self.save(part_file)  # more parts than chunks: this one is empty, but there
+        error = self.error() if self.done else None
         if report is not None:
-            progress.error = self._shown_error(progress)
-            report(progress)
-        if self.effort.target_error is not None and self.met(self.error()):
+            report(progress.at(error))
+        if self.met(error):
             return
         with ThreadPoolExecutor(threads) as pool:
             try:
@@ -342,9 +347,7 @@ class Build:
                     progress.paths += last - first
                     error = self.error() if report is not None or self.effort.target_error is not None else None
                     if report is not None:
-                        progress.error = error.total_variation if error else None
-                        progress.cells = error.cells if error else None
-                        report(progress)
+                        report(progress.at(error))
                     self.check_leaks(doubt=4.0)
                     if self.met(error):
                         return
@@ -355,11 +358,6 @@ class Build:
             raise TSDFError(
                 f"--target-error {self.effort.target_error:g} was not met after {MAX_PATHS:.2g} paths: give more"
             )
-
-    def _shown_error(self, progress: Progress) -> float | None:
-        error = self.error() if self.done else None
-        progress.cells = error.cells if error else None
-        return error.total_variation if error else None
 
     def check_leaks(self, doubt: float = 0.0) -> None:
         """Refuse a grain whose tracing loses too much light.

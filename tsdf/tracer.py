@@ -262,9 +262,8 @@ def count_block(count, block, edges, counters):
         lc = length_cell(length, edges)
         cells[c, T.AT_L + lc] += weight
         cells[c, T.AT_L_SUM + lc] += energy_length
-        boxed = (
-            mix(np.uint64(path)) & np.uint64(7) == 0
-        )  # an eighth of the paths tells the joint distributions well enough
+        # an eighth of the paths tells the joint distributions well enough
+        boxed = mix(np.uint64(path)) & np.uint64(7) == 0
         half, lb = replicate & 1, min(int(length * (BOX_L / T.BOX_LENGTH)), BOX_L - 1)
         forth, back = weight, weight
         if weight < LIGHT:
