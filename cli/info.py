@@ -12,6 +12,8 @@ from tsdf.cli.common import Tool, plain
 if TYPE_CHECKING:
     from tsdf.table import Table
 
+LENGTHS = ("lambda_b", "lambda_beta", "lambda_s")  # of the medium
+COEFFICIENTS = ("sigma_t", "sigma_s", "sigma_a")
 UNITS = {"mean_z": "R", "mean_r": "R", "mean_miss_chord": "R", "mean_path_length": "R"}
 
 
@@ -27,14 +29,31 @@ UNITS = {"mean_z": "R", "mean_r": "R", "mean_miss_chord": "R", "mean_path_length
     help="Absorption coefficient times bounding radius [1], >= 0; albedo and mean cosine are then those of the "
     "absorbing grain.",
 )
-def main(file: str, as_json: bool, absorption: float) -> None:
+@click.option(
+    "--packing",
+    type=float,
+    metavar="F",
+    help="Share of a volume filled by bounding spheres [1], 0 < F <= 0.74; adds the medium of such grains.",
+)
+@click.option(
+    "--radius",
+    type=float,
+    metavar="L",
+    help="Bounding radius of the grains in that medium, whose lengths are then in the unit of L.  [default: in R]",
+)
+def main(file: str, as_json: bool, absorption: float, packing: float | None, radius: float | None) -> None:
     """Show what the table FILE holds: grain, optics, statistics with standard errors, errors, energy, origin."""
     from tsdf import format
     from tsdf.errors import UsageError
 
     if not 0.0 <= absorption < math.inf:
         raise UsageError(f"--absorption is a finite number >= 0, not {absorption:g}")
-    facts = describe(format.read(file), absorption)
+    if radius is not None and packing is None:
+        raise UsageError("--radius is of the grains of a medium: give its --packing too")
+    table = format.read(file)
+    facts = describe(table, absorption)
+    if packing is not None:
+        facts["medium"] = describe_medium(table, packing, radius, absorption)
     if as_json:
         click.echo(json.dumps(facts, indent=1))
     else:
@@ -78,6 +97,29 @@ def describe(table: "Table", absorption: float = 0.0) -> dict[str, Any]:
     }
 
 
+def describe_medium(
+    table: "Table", packing: float, radius: float | None = None, absorption: float = 0.0
+) -> dict[str, Any]:
+    """Return the medium of packed grains, as ``tsdf-info --json`` writes it; None where a number is not finite.
+
+    Lengths are in the unit of `radius`, or in R where it is None; absorption is sigma_a R.
+    """
+    from tsdf.errors import UsageError
+    from tsdf.medium import Component, free_path, volume_parameters
+
+    unit = 1.0 if radius is None else radius
+    try:
+        grains = [Component(table, radius=unit)]
+        path, volume = free_path(grains, packing), volume_parameters(grains, packing, [absorption / unit])
+    except UsageError as error:
+        raise UsageError(f"--packing or --radius: {error}") from error
+    numbers = {name: getattr(path, name) for name in LENGTHS}
+    numbers |= {name: getattr(volume, name) for name in (*COEFFICIENTS, "albedo", "g", "transport_mean_free_path")}
+    return {"packing_fraction": packing, "radius": radius} | {
+        name: value if math.isfinite(value) else None for name, value in numbers.items()
+    }
+
+
 def _lines(facts: Mapping[str, Any]) -> Iterator[str]:
     """The same for people."""
 
@@ -117,6 +159,20 @@ def _lines(facts: Mapping[str, Any]) -> Iterator[str]:
         yield row(name, f"{text} {UNITS.get(name, '')}".rstrip())
     moments = " ".join(f"{value:.4f}" for value in facts["legendre_moments"])
     yield row("legendre_moments", moments)
+    if "medium" in facts:
+        medium = facts["medium"]
+        length = "R" if medium["radius"] is None else "units"
+        yield f"medium, packing fraction {medium['packing_fraction']:g}"
+        if medium["radius"] is not None:
+            yield row("radius", f"{medium['radius']:g} units")
+        for name in LENGTHS:
+            yield row(name, f"{known(medium[name], '.6g')} {length}")
+        for name in COEFFICIENTS:
+            yield row(name, f"{known(medium[name], '.6g')} / {length.removesuffix('s')}")
+        yield row("albedo", f"{medium['albedo']:.6g}")
+        yield row("g", known(medium["g"], ".6g"))
+        path = medium["transport_mean_free_path"]
+        yield row("transport path", "infinite" if path is None else f"{path:.6g} {length}")
     yield "errors, as total variation"
     error, loss = facts["table_error"], facts["factorisation_error"]
     parts = f"sampling {error['sampling_noise']:.2g}, cell width {error['cell_width']:.2g}"

@@ -28,15 +28,24 @@ LAYERS = [
         "sampling",
         "vectors",
         "horizon",
+        "image",
+        "lights",
+        "medium",
+        "packing",
     },
-    {"grains", "format", "estimate", "horizon"},
-    {"tracer", "exact"},
-    {"scatterometer", "validate", "plots"},
+    {"grains", "format", "estimate", "horizon", "sampler", "scene"},
+    {"tracer", "exact", "geometry"},
+    {"scatterometer", "validate", "plots", "explicit"},
+    {"transport"},
+    {"world"},
+    {"render"},
 ]
 DOORS = {
     "trimesh": {"grains"},
     "embreex": {"grains"},
-    "OpenEXR": {"format"},
+    "OpenEXR": {"format", "image"},
+    "colour": {"image"},
+    "PIL": {"image"},
     "matplotlib": {"plots"},
     "jsonschema": {"format"},
 }
@@ -97,7 +106,7 @@ def test_library_does_not_import_the_command_line() -> None:
         assert not any(name.startswith(("click", "tsdf.cli")) for name, _ in imports(path)), path
 
 
-@pytest.mark.parametrize("command", ["build", "info", "merge", "plot", "validate"])
+@pytest.mark.parametrize("command", ["build", "info", "merge", "plot", "render", "validate"])
 def test_help_loads_nothing_slow(command: str) -> None:
     """``--help`` is instant because no array library is loaded for it."""
     code = (

@@ -77,6 +77,51 @@ def test_absorption_that_cannot_be(value):
     fails(run(info, SPHERE, "--absorption", value), 2, "absorption")
 
 
+def test_medium_of_packed_grains():
+    """--packing says what `medium` says, in R; with --radius the same in its unit, absorption staying sigma_a R."""
+    from tsdf.medium import Component, free_path, volume_parameters
+
+    facts = json.loads(run(info, CUBE, "--json", "--packing", "0.6", "--absorption", "0.1").stdout)["medium"]
+    grains = [Component(format.read(CUBE))]
+    path, volume = free_path(grains, 0.6), volume_parameters(grains, 0.6, [0.1])
+    lengths = {"lambda_b": path.lambda_b, "lambda_beta": path.lambda_beta, "lambda_s": path.lambda_s}
+    lengths["transport_mean_free_path"] = volume.transport_mean_free_path
+    coefficients = {name: getattr(volume, name) for name in ("sigma_t", "sigma_s", "sigma_a")}
+    numbers = {"albedo": volume.albedo, "g": volume.g}
+    assert facts == {"packing_fraction": 0.6, "radius": None} | lengths | coefficients | numbers
+    options = ("--packing", "0.6", "--absorption", "0.1", "--radius", "0.001")
+    scaled = json.loads(run(info, CUBE, "--json", *options).stdout)["medium"]
+    assert all(scaled[name] == pytest.approx(0.001 * value) for name, value in lengths.items())
+    assert all(scaled[name] == pytest.approx(1000.0 * value) for name, value in coefficients.items())
+    assert all(scaled[name] == pytest.approx(value) for name, value in numbers.items())
+    text = run(info, CUBE, *options).stdout
+    assert f"{0.001 * path.lambda_beta:.6g} units" in text and f"{1000.0 * volume.sigma_t:.6g} / unit\n" in text
+    text = run(info, SPHERE, "--packing", "0.6").stdout
+    assert "lambda_b             0.888889 R\n" in text and "sigma_a              0 / R\n" in text
+    assert "medium" not in run(info, CUBE).stdout and "medium" not in json.loads(run(info, CUBE, "--json").stdout)
+
+
+def test_medium_without_deflection():
+    """Grains of the surrounding material never turn light: an infinite path is a word, and null in JSON."""
+    options = (CHECKS / "cube_identity.tsdf.exr", "--packing", "0.5")
+    assert "transport path       infinite\n" in run(info, *options).stdout
+    assert json.loads(run(info, *options, "--json").stdout)["medium"]["transport_mean_free_path"] is None
+
+
+@pytest.mark.parametrize(
+    ("options", "parts"),
+    [
+        (("--packing", "0.8"), ("--packing", "0.74")),
+        (("--packing", "nan"), ("--packing", "0.74")),
+        (("--packing", "0.5", "--radius", "0"), ("--radius", "> 0")),
+        (("--radius", "1"), ("--radius", "--packing")),
+        (("--packing", "x"), ("--packing",)),
+    ],
+)
+def test_medium_that_cannot_be(options, parts):
+    fails(run(info, SPHERE, *options), 2, *parts)
+
+
 def test_text_of_a_file_is_escaped(tmp_path):
     from tsdf.table import Table, thawed
 

@@ -15,6 +15,10 @@ class GrainError(TSDFError):
     """The geometry of a grain cannot be read, or is not a closed, simple surface."""
 
 
+class SceneError(TSDFError):
+    """A scene cannot be read, or says something that cannot be meant."""
+
+
 class FormatError(TSDFError):
     """A file does not follow schema/SPEC.md.
 

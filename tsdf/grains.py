@@ -62,6 +62,8 @@ class Grain:
         Vertex indices, counter-clockwise seen from the void. Read-only.
     bounding_radius : float
         Radius of the minimal bounding sphere before normalisation [the file's unit].
+    centre : (3,) float64
+        Its centre before normalisation [the file's unit].
     area, volume : float
         Surface area [R^2] and volume of the material [R^3], cavities' surface counted and their volume not.
     convex : bool
@@ -89,6 +91,7 @@ class Grain:
     bodies: int
     notes: tuple[str, ...] = field(default=())
     mesh_hash: str = ""
+    centre: Floats = field(default_factory=lambda: np.zeros(3))
 
 
 class Crossings(NamedTuple):
@@ -138,12 +141,23 @@ def load_grain(source: str | Path, repair: bool = False, **parameters: Any) -> G
         nothing, none = np.empty((0, 3)), np.empty((0, 3), np.int32)
         area, volume = 4 * np.pi, 4 * np.pi / 3
         return Grain("sphere", name, {}, nothing, none, 1.0, area, volume, True, 1, (), digest)
-    vertices, faces = _read_mesh(Path(source))
+    vertices, faces = read_mesh(Path(source))
     return grain_from_mesh(vertices, faces, name=Path(source).name, repair=repair)
 
 
-def _read_mesh(path: Path) -> tuple[NDArray, NDArray]:
-    """Return all triangles of a file, placed as its scene places them, with nothing merged yet."""
+def read_mesh(path: Path) -> tuple[NDArray, NDArray]:
+    """Return all triangles of a mesh file, placed as its scene places them, with nothing merged or checked.
+
+    Returns
+    -------
+    vertices : (n, 3) float
+    faces : (m, 3) int
+
+    Raises
+    ------
+    GrainError
+        The file does not exist, cannot be read or holds no faces.
+    """
     try:
         if not path.exists():
             built_ins = ", ".join(BUILT_INS)
@@ -290,6 +304,7 @@ def grain_from_mesh(
         bodies,
         tuple(notes),
         mesh_hash(points, triangles),
+        centre,
     )
     crossings = check_crossings(grain, rays=20_000 if grain.convex else 200_000)
     if crossings.share > 0:
@@ -331,17 +346,22 @@ def embree_scene(grain: Grain) -> Any:
     GrainError
         The grain has no mesh, or one that Embree must not be given: it reads out of bounds without a word.
     """
+    return triangle_scene(grain.vertices, grain.faces, grain.name)
+
+
+def triangle_scene(vertices: ArrayLike, faces: ArrayLike, name: str = "mesh") -> Any:
+    """Return the robust Embree scene of any triangles, as `embree_scene` does for a grain's."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
-    vertices = np.array(grain.vertices, np.float32, order="C")
-    faces = np.array(grain.faces, np.int32, order="C")
-    if len(faces) == 0 or vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
-        raise GrainError(f"{grain.name}: has no triangle mesh to cast rays at")
-    if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
-        raise GrainError(f"{grain.name}: the mesh is damaged; make it by grain_from_mesh")
+    corners = np.array(vertices, np.float32, order="C")
+    triangles = np.array(faces, np.int32, order="C")
+    if len(triangles) == 0 or corners.shape[1:] != (3,) or triangles.shape[1:] != (3,):
+        raise GrainError(f"{name}: has no triangle mesh to cast rays at")
+    if not np.isfinite(corners).all() or triangles.min() < 0 or triangles.max() >= len(corners):
+        raise GrainError(f"{name}: the mesh is damaged; make it by grain_from_mesh")
     scene = EmbreeScene(robust=True)
-    TriangleMesh(scene, vertices, faces)  # copied into the scene, which owns it
+    TriangleMesh(scene, corners, triangles)  # copied into the scene, which owns it
     return scene
 
 

@@ -1,0 +1,520 @@
+"""Where things are in a scene: boundaries of media, opaque surfaces, what a ray meets and how far the nearest is.
+
+Media have a boundary each: a closed mesh, in a ray-engine scene of its own, or a slab, box or sphere, found exactly.
+Opaque surfaces are triangles, all in one more ray-engine scene, and exact balls. Which medium a ray is in is never
+remembered: the first facet of a medium's own boundary that the ray meets says on which side the ray runs, so that
+boundaries that touch, coincide with a surface or hold the camera need no care. Embree names the facet; the distance
+comes from the facet's plane in float64. What light does there is `transport`.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from tsdf.errors import GrainError, SceneError
+from tsdf.grains import first_hit, grain_from_mesh, read_mesh, triangle_scene
+from tsdf.scene import Box, MediumSpec, Mesh, Rectangle, Scene, Slab, Sphere, SurfaceSpec
+from tsdf.vectors import dot, step
+
+SLACK = 2e-6  # [of a facet's largest coordinate] a point this near to a facet is on it: 30 float32 ulps
+FIELD_CELLS = 300_000  # of the grid of distances: half a second to make
+SAMPLES = 4096  # points at most that stand for one triangle; larger triangles are measured exactly
+LEAST_OVERLAP = 1e-3  # [of the smaller extent] media that overlap by less only touch
+MESH, SLAB, BOX, BALL = 0, 1, 2, 3  # kinds of boundaries
+NONE = -1
+
+
+class Geometry(NamedTuple):
+    """What kernels ask about a scene; coordinates are relative to the scene's centre.
+
+    kind (m,), shape (m, 6), slack (m,), engine (m,) of media: kind, numbers, thickness of an exact boundary [unit],
+    ray-engine scene; planes (f, 4), plane_slack (f,), surface (f,) of facets: normal and height, thickness, surface;
+    balls (b, 4), ball_surface (b,): centre, radius, surface; reflectance (s, 3); field (x, y, z), field_low (3,),
+    field_step: distances of points of a grid to the nearest facet; field_beyond: distances outside it are at least
+    those to the grid; engines: the number of ray-engine scenes; solid: the
+    first of them is that of the surfaces.
+    """
+
+    kind: np.ndarray
+    shape: np.ndarray
+    slack: np.ndarray
+    engine: np.ndarray
+    planes: np.ndarray
+    plane_slack: np.ndarray
+    surface: np.ndarray
+    balls: np.ndarray
+    ball_surface: np.ndarray
+    reflectance: np.ndarray
+    field: np.ndarray
+    field_low: np.ndarray
+    field_step: float
+    field_beyond: bool
+    engines: int
+    solid: bool
+
+
+# ------------------------------------------------------------------------------------------- for kernels
+
+
+@njit(cache=True)
+def facet_hit(planes, facet, p, d):
+    """Return distance along d from p to a facet's plane, and the cosine of d to its normal."""
+    n = (planes[facet, 0], planes[facet, 1], planes[facet, 2])
+    cosine = dot(n, d)
+    if cosine == 0.0:
+        return math.inf, 0.0
+    return (planes[facet, 3] - dot(n, p)) / cosine, cosine
+
+
+@njit(cache=True, error_model="numpy")
+def exact_hit(kind, shape, p, d):
+    """Return distance to a slab, box or ball, whether p is inside, and the outward normal there."""
+    if kind == BALL:
+        q = (p[0] - shape[0], p[1] - shape[1], p[2] - shape[2])
+        along, rest = dot(q, d), dot(q, q) - shape[3] * shape[3]
+        root = along * along - rest
+        if rest < 0.0:
+            t = math.sqrt(root) - along
+        elif along >= 0.0 or root <= 0.0:
+            return math.inf, False, (0.0, 0.0, 0.0)
+        else:
+            t = -along - math.sqrt(root)
+        m = step(q, t, d)
+        return t, rest < 0.0, (m[0] / shape[3], m[1] / shape[3], m[2] / shape[3])
+    first = 2 if kind == SLAB else 0
+    near, far, near_axis, far_axis, inside = -math.inf, math.inf, -1, -1, True
+    for k in range(first, 3):
+        low, high = shape[k] - p[k], shape[3 + k] - p[k]
+        if not low < 0.0 < high:
+            inside = False
+        if d[k] == 0.0:
+            if not low < 0.0 < high:
+                return math.inf, False, (0.0, 0.0, 0.0)
+            continue
+        a, b = low / d[k], high / d[k]
+        if d[k] < 0.0:
+            a, b = b, a
+        if a > near:
+            near, near_axis = a, k
+        if b < far:
+            far, far_axis = b, k
+    if not inside and (near > far or near < 0.0 or near_axis < 0):
+        return math.inf, False, (0.0, 0.0, 0.0)
+    axis = far_axis if inside else near_axis
+    if axis < 0:
+        return math.inf, inside, (0.0, 0.0, 0.0)
+    side = 1.0 if (d[axis] > 0.0) == inside else -1.0
+    n = (side if axis == 0 else 0.0, side if axis == 1 else 0.0, side if axis == 2 else 0.0)
+    return (far if inside else near), inside, n
+
+
+@njit(cache=True)
+def ball_hit(balls, p, d):
+    """Return distance to the nearest of the opaque balls and its number, or infinity and -1."""
+    nearest, which = math.inf, NONE
+    for b in range(balls.shape[0]):
+        q = (p[0] - balls[b, 0], p[1] - balls[b, 1], p[2] - balls[b, 2])
+        along = dot(q, d)
+        root = along * along - (dot(q, q) - balls[b, 3] * balls[b, 3])
+        if root <= 0.0:
+            continue
+        root = math.sqrt(root)
+        t = -along - root
+        if t < 0.0:
+            t = root - along
+        if 0.0 <= t < nearest:
+            nearest, which = t, b
+    return nearest, which
+
+
+@njit(cache=True)
+def exact_depth(kind, shape, p):
+    """Return the distance of p to a slab's, box's or ball's boundary, positive inside; outside a box at most that."""
+    if kind == BALL:
+        q = (p[0] - shape[0], p[1] - shape[1], p[2] - shape[2])
+        return shape[3] - math.sqrt(dot(q, q))
+    depth = math.inf
+    for k in range(2 if kind == SLAB else 0, 3):
+        depth = min(depth, min(p[k] - shape[k], shape[3 + k] - p[k]))
+    return depth
+
+
+@njit(cache=True)
+def clearance(g, m, p):
+    """Return a length within which p of medium m is sure to have neither its boundary nor a surface around it."""
+    bound = math.inf
+    if g.kind[m] != MESH:
+        bound = exact_depth(g.kind[m], g.shape[m], p)
+    for b in range(g.balls.shape[0]):
+        q = (p[0] - g.balls[b, 0], p[1] - g.balls[b, 1], p[2] - g.balls[b, 2])
+        bound = min(bound, abs(math.sqrt(dot(q, q)) - g.balls[b, 3]))
+    nx, ny, nz = g.field.shape
+    if nx == 0:
+        return bound
+    h = g.field_step
+    x, y, z = (p[0] - g.field_low[0]) / h, (p[1] - g.field_low[1]) / h, (p[2] - g.field_low[2]) / h
+    if 0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz:
+        i, j, k = int(x), int(y), int(z)
+        x, y, z = x - i - 0.5, y - j - 0.5, z - k - 0.5
+        return min(bound, g.field[i, j, k] - h * math.sqrt(x * x + y * y + z * z))
+    if not g.field_beyond:
+        return 0.0
+    x, y, z = max(-x, x - nx, 0.0), max(-y, y - ny, 0.0), max(-z, z - nz, 0.0)
+    return min(bound, h * math.sqrt(x * x + y * y + z * z))
+
+
+# --------------------------------------------------------------------------------------------- from specs
+
+
+class Triangles(NamedTuple):
+    """Corners (n, 3) float64 and faces (m, 3) int32 of a mesh."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+@dataclass(eq=False)
+class Place:
+    """The geometry of a scene: arrays for kernels, the ray engine, and what must be asked before rendering.
+
+    Attributes
+    ----------
+    arrays : Geometry
+    engines : list
+        Ray-engine scenes: of the surfaces first if there are any, then of the media with a mesh.
+    first_facet : list of int
+        Number of the first facet of each.
+    centre : (3,) float64
+        World coordinates of the origin of all arrays [unit].
+    boundaries : list of Triangles or None
+        Of the media, relative to `centre`; None for exact shapes.
+    surfaces : list of Triangles or None
+        Of the surfaces, relative to `centre`; None for balls.
+    notes : tuple of str
+        What the user should know.
+    """
+
+    arrays: Geometry
+    engines: list
+    first_facet: list[int]
+    centre: np.ndarray
+    boundaries: list[Triangles | None]
+    surfaces: list[Triangles | None]
+    notes: tuple[str, ...]
+
+    def hits(self, starts: np.ndarray, ways: np.ndarray, out: np.ndarray) -> None:
+        """Write the facet that each ray meets first in each ray-engine scene, -1 for none, to (engines, n) int32."""
+        for row, (engine, first) in enumerate(zip(self.engines, self.first_facet, strict=True)):
+            prims = engine.run(starts, ways)
+            np.add(prims, first, out=out[row, : len(prims)], where=prims >= 0)
+            out[row, : len(prims)][prims < 0] = NONE
+
+    def inside(self, m: int, points: np.ndarray) -> np.ndarray:
+        """Return (n,) bool whether points (n, 3), relative to the centre, are inside medium m."""
+        kind = self.arrays.kind[m]
+        if kind != MESH:
+            return np.array([exact_depth(kind, self.arrays.shape[m], tuple(p)) > 0.0 for p in points], bool)
+        row = int(self.arrays.engine[m])
+        return within(self.engines[row], self.arrays.planes[self.first_facet[row] :, :3], points)
+
+
+def within(engine: Any, normals: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return (n,) bool whether points (n, 3) are inside a closed mesh: the first facet met is met from inside."""
+    way = np.array([0.36, 0.48, 0.8])  # any direction that modelled facets are not likely to be parallel to
+    facet = first_hit(engine, points, np.broadcast_to(way, points.shape))
+    return (facet >= 0) & (normals[facet] @ way > 0.0)
+
+
+def box_mesh(low: Sequence[float], high: Sequence[float]) -> Triangles:
+    """Return the closed mesh of a box, facets wound so that normals point outward."""
+    corners = np.array([[(low, high)[(i >> k) & 1][k] for k in range(3)] for i in range(8)], np.float64)
+    quads = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
+    return Triangles(corners, np.array([f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))], np.int32))
+
+
+def _surface_mesh(spec: SurfaceSpec, where: str) -> Triangles:
+    """Return the triangles of an opaque surface, which need not be closed."""
+    shape = spec.shape
+    if isinstance(shape, Box):
+        return box_mesh(shape.low, shape.high)
+    if isinstance(shape, Rectangle):
+        c, u, v = (np.array(x, np.float64) for x in (shape.centre, shape.u, shape.v))
+        return Triangles(np.array([c - u - v, c + u - v, c + u + v, c - u + v]), np.array([[0, 1, 2], [0, 2, 3]]))
+    assert isinstance(shape, Mesh)
+    try:
+        vertices, faces = read_mesh(shape.file)
+    except GrainError as error:
+        raise SceneError(f"{where}: {_of_scenes(error)}") from None
+    points = np.asarray(vertices, np.float64) * shape.scale + np.array(shape.translate, np.float64)
+    if not np.isfinite(points).all():
+        raise SceneError(f"{where}: {shape.file}: holds coordinates that are not finite; export the mesh again")
+    corners = points[faces]
+    flat = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) == 0.0
+    if flat.all():
+        raise SceneError(f"{where}: {shape.file}: no face has an area; export the mesh again")
+    return Triangles(points, np.asarray(faces, np.int32)[~flat])
+
+
+def _of_scenes(error: GrainError) -> str:
+    """Return a message about a grain's mesh in the words of scenes, whose tool cannot repair."""
+    return str(error).replace(" or pass --repair", "").replace("a grain is", "a boundary is").replace("a grain", "it")
+
+
+def _boundary(spec: MediumSpec, where: str) -> tuple[Triangles, tuple[str, ...]]:
+    """Return the closed mesh around a medium, checked as a grain is."""
+    shape = spec.shape
+    assert isinstance(shape, Mesh)
+    try:
+        vertices, faces = read_mesh(shape.file)
+        body = grain_from_mesh(vertices, faces, name=str(shape.file))
+    except GrainError as error:
+        raise SceneError(f"{where}: {_of_scenes(error)}") from None
+    points = (body.centre + body.bounding_radius * body.vertices) * shape.scale + np.array(shape.translate)
+    return Triangles(points, body.faces), tuple(f"{where}: {note}" for note in body.notes)
+
+
+def _extent(low: np.ndarray, high: np.ndarray, triangles: Sequence[Triangles | None]) -> tuple[np.ndarray, np.ndarray]:
+    for mesh in triangles:
+        if mesh is not None:
+            low, high = np.minimum(low, mesh.vertices.min(axis=0)), np.maximum(high, mesh.vertices.max(axis=0))
+    return low, high
+
+
+def place(scene: Scene) -> Place:
+    """Load and check the geometry of a scene.
+
+    Raises
+    ------
+    SceneError
+        A boundary that is not a closed, simple surface, media that overlap, a mesh that cannot be read.
+    """
+    notes: list[str] = []
+    boundaries: list[Triangles | None] = []
+    for number, medium in enumerate(scene.media, 1):
+        if isinstance(medium.shape, Mesh):
+            mesh, found = _boundary(medium, f"{scene.name}: [[medium]] {number} ({medium.name})")
+            notes += found
+            boundaries.append(mesh)
+        else:
+            boundaries.append(None)
+    surfaces = [
+        None if isinstance(s.shape, Sphere) else _surface_mesh(s, f"{scene.name}: [[surface]] {i} ({s.name})")
+        for i, s in enumerate(scene.surfaces, 1)
+    ]
+
+    # The media's middle is the origin, where float32 is finest
+    nothing = np.full(3, math.inf)
+    low, high = _extent(nothing, -nothing, boundaries)
+    for medium in scene.media:
+        if isinstance(medium.shape, Box):
+            low, high = np.minimum(low, medium.shape.low), np.maximum(high, medium.shape.high)
+        elif isinstance(medium.shape, Sphere):
+            centre, radius = np.array(medium.shape.centre), medium.shape.radius
+            low, high = np.minimum(low, centre - radius), np.maximum(high, centre + radius)
+        elif isinstance(medium.shape, Slab):
+            low[2], high[2] = min(low[2], medium.shape.low), max(high[2], medium.shape.high)
+    if not np.isfinite(low).all():
+        wide, far = _extent(nothing, -nothing, surfaces)
+        low, high = (
+            np.where(np.isfinite(a), a, np.where(np.isfinite(b), b, 0.0)) for a, b in ((low, wide), (high, far))
+        )
+    centre = 0.5 * (low + high)
+    boundaries = [m and Triangles(m.vertices - centre, m.faces) for m in boundaries]
+    surfaces = [m and Triangles(m.vertices - centre, m.faces) for m in surfaces]
+
+    media = len(scene.media)
+    kind, shape, slack = np.zeros(media, np.int32), np.zeros((media, 6)), np.zeros(media)
+    for i, medium in enumerate(scene.media):
+        s = medium.shape
+        if isinstance(s, Slab):
+            kind[i], shape[i, 2], shape[i, 5] = SLAB, s.low - centre[2], s.high - centre[2]
+        elif isinstance(s, Box):
+            kind[i], shape[i, :3], shape[i, 3:] = BOX, s.low - centre, s.high - centre
+        elif isinstance(s, Sphere):
+            kind[i], shape[i, :3], shape[i, 3] = BALL, s.centre - centre, s.radius
+        slack[i] = 1e-9 * max(np.abs(shape[i]).max(), medium.radius)
+
+    engines, first_facet, meshes, owners = [], [], [], []
+    facets = 0
+    solid = [(i, mesh) for i, mesh in enumerate(surfaces) if mesh is not None]
+    if solid:
+        starts = np.cumsum([0] + [len(mesh.vertices) for _, mesh in solid[:-1]])
+        united = Triangles(
+            np.vstack([mesh.vertices for _, mesh in solid]),
+            np.vstack([mesh.faces + at for (_, mesh), at in zip(solid, starts, strict=True)]),
+        )
+        owners.append(np.repeat([i for i, _ in solid], [len(mesh.faces) for _, mesh in solid]))
+        meshes.append(united)
+    engine = np.full(media, NONE, np.int32)
+    for i, boundary in enumerate(boundaries):
+        if boundary is not None:
+            engine[i] = len(meshes)
+            meshes.append(boundary)
+            owners.append(np.full(len(boundary.faces), NONE))
+    for mesh in meshes:
+        engines.append(triangle_scene(mesh.vertices, mesh.faces))
+        first_facet.append(facets)
+        facets += len(mesh.faces)
+    planes, plane_slack = _planes(meshes)
+    balls = [(i, s.shape) for i, s in enumerate(scene.surfaces) if isinstance(s.shape, Sphere)]
+    field, field_low, field_step, beyond = _field(meshes, low - centre, high - centre, scene)
+    arrays = Geometry(
+        kind=kind,
+        shape=shape,
+        slack=slack,
+        engine=engine,
+        planes=planes,
+        plane_slack=plane_slack,
+        surface=np.concatenate(owners).astype(np.int32) if owners else np.zeros(0, np.int32),
+        balls=np.array([[*(np.array(b.centre) - centre), b.radius] for _, b in balls]).reshape(-1, 4),
+        ball_surface=np.array([i for i, _ in balls], np.int32),
+        reflectance=np.array([s.reflectance for s in scene.surfaces], np.float64).reshape(-1, 3),
+        field=field,
+        field_low=field_low,
+        field_step=field_step,
+        field_beyond=beyond,
+        engines=len(engines),
+        solid=bool(solid),
+    )
+    made = Place(arrays, engines, first_facet, centre, boundaries, surfaces, tuple(notes))
+    _no_overlap(made, scene)
+    return made
+
+
+def _planes(meshes: Sequence[Triangles]) -> tuple[np.ndarray, np.ndarray]:
+    """Return normal and height (f, 4) of the facets of all meshes, and how near to each a point counts as on it."""
+    if not meshes:
+        return np.zeros((0, 4)), np.zeros(0)
+    corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    planes = np.column_stack((normals, np.einsum("ij,ij->i", normals, corners.mean(axis=1))))
+    return planes, SLACK * np.abs(corners).max(axis=(1, 2))
+
+
+def _field(
+    meshes: Sequence[Triangles], low: np.ndarray, high: np.ndarray, scene: Scene
+) -> tuple[np.ndarray, np.ndarray, float, bool]:
+    """Return the grid of distances to the nearest facet: distances, low corner, step, and if they bound those outside.
+
+    Of endless media the grid covers all facets, so that outside it the distance to the grid is a bound; media with an
+    extent lie wholly inside it.
+    """
+    if not meshes or not scene.media:
+        return np.zeros((0, 0, 0), np.float32), np.zeros(3), 1.0, True
+    endless = any(isinstance(medium.shape, Slab) for medium in scene.media)
+    if endless:
+        nothing = np.full(3, math.inf)
+        low, high = _extent(nothing, -nothing, meshes)
+    size = np.maximum(high - low, 1e-3 * (high - low).max())
+    h = float((size.prod() / FIELD_CELLS) ** (1 / 3))
+    counts = np.ceil(size / h).astype(int) + 2
+    low = 0.5 * (low + high) - 0.5 * counts * h
+    centres = np.stack(
+        np.meshgrid(*(low[k] + h * (np.arange(counts[k]) + 0.5) for k in range(3)), indexing="ij"), axis=-1
+    ).reshape(-1, 3)
+    corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
+    found = distances(corners, centres, 0.25 * h)
+    return found.reshape(counts).astype(np.float32), low, h, endless
+
+
+def distances(corners: np.ndarray, points: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return (n,) float64 lower bounds, short by at most `tolerance` or so, of distances from points to triangles.
+
+    Parameters
+    ----------
+    corners : (m, 3, 3) float64
+        Of the triangles.
+    points : (n, 3) float64
+    tolerance : float
+        Triangles are stood for by points this far apart, but for those that would need more than `SAMPLES`.
+    """
+    from scipy.spatial import cKDTree
+
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    parts = np.maximum(np.ceil(edges / tolerance).astype(np.int64), 1)
+    large = parts**2 > SAMPLES
+    nearest = np.full(len(points), math.inf)
+    samples = []
+    for n in np.unique(parts[~large]):  # centroids of n^2 like parts of each triangle
+        i, j = np.divmod(np.arange(n * n), n)
+        up = i + j < n
+        a, b = np.where(up, i + 1 / 3, n - i - 1 / 3) / n, np.where(up, j + 1 / 3, n - j - 1 / 3) / n
+        of = corners[~large & (parts == n)]
+        weights = np.stack((1 - a - b, a, b))
+        samples.append(np.einsum("kp,tkx->tpx", weights, of).reshape(-1, 3))
+    if samples:
+        reach = 2 / 3 * float((edges / parts)[~large].max())  # no point of a part is farther from its centroid
+        nearest = np.maximum(cKDTree(np.concatenate(samples)).query(points, workers=-1)[0] - reach, 0.0)
+    if large.any():
+        exact_distances(np.ascontiguousarray(corners[large]), points, nearest)
+    return nearest
+
+
+@njit(cache=True)
+def triangle_distance(corners, p):
+    """Return the distance of p to a triangle (3, 3)."""
+    a = (corners[0, 0], corners[0, 1], corners[0, 2])
+    u = (corners[1, 0] - a[0], corners[1, 1] - a[1], corners[1, 2] - a[2])
+    v = (corners[2, 0] - a[0], corners[2, 1] - a[1], corners[2, 2] - a[2])
+    q = (p[0] - a[0], p[1] - a[1], p[2] - a[2])
+    uu, uv, vv, qu, qv = dot(u, u), dot(u, v), dot(v, v), dot(q, u), dot(q, v)
+    det = uu * vv - uv * uv
+    s, t = vv * qu - uv * qv, uu * qv - uv * qu
+    if s >= 0.0 and t >= 0.0 and s + t <= det:
+        w = step(step(q, -s / det, u), -t / det, v)
+        return math.sqrt(dot(w, w))
+    best = math.inf
+    for k in range(3):
+        o = a if k < 2 else step(a, 1.0, u)
+        e = u if k == 0 else (v if k == 1 else step(v, -1.0, u))
+        w = step(p, -1.0, o)
+        w = step(w, -min(max(dot(w, e) / dot(e, e), 0.0), 1.0), e)
+        best = min(best, dot(w, w))
+    return math.sqrt(best)
+
+
+@njit(cache=True)
+def exact_distances(corners, points, nearest):
+    """Lower (n,) `nearest` to the distances of points (n, 3) to any of the triangles (m, 3, 3)."""
+    for i in range(points.shape[0]):
+        p = (points[i, 0], points[i, 1], points[i, 2])
+        for t in range(corners.shape[0]):
+            nearest[i] = min(nearest[i], triangle_distance(corners[t], p))
+
+
+def _no_overlap(made: Place, scene: Scene) -> None:
+    """Refuse media that share room: no model says what a place in two of them is."""
+    count = len(scene.media)
+    if count < 2:
+        return
+    rng = np.random.default_rng(0)
+    extents = []
+    for i in range(count):
+        mesh, s = made.boundaries[i], made.arrays.shape[i]
+        if mesh is not None:
+            extents.append((mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)))
+        elif made.arrays.kind[i] == BALL:
+            extents.append((s[:3] - s[3], s[:3] + s[3]))
+        else:
+            free = np.array([made.arrays.kind[i] == SLAB] * 2 + [False])
+            extents.append((np.where(free, -math.inf, s[:3]), np.where(free, math.inf, s[3:])))
+    for i in range(count):
+        for j in range(i):
+            low, high = np.maximum(extents[i][0], extents[j][0]), np.minimum(extents[i][1], extents[j][1])
+            low, high = np.where(np.isfinite(low), low, -1.0), np.where(np.isfinite(high), high, 1.0)
+            smaller = min((e[1] - e[0]).min() for e in (extents[i], extents[j]))
+            if (high - low < LEAST_OVERLAP * smaller).any():
+                continue
+            points = low + (high - low) * rng.random((100_000, 3))
+            both = made.inside(i, points) & made.inside(j, points)
+            if both.any():
+                at = "({:.4g}, {:.4g}, {:.4g})".format(*(points[both][0] + made.centre))
+                a, b = scene.media[j].name, scene.media[i].name
+                raise SceneError(
+                    f"{scene.name}: media {a!r} and {b!r} overlap, at {at} for one; move or cut one of them"
+                )

@@ -1,0 +1,261 @@
+"""Pictures: samples of pixels shared out over threads, added up in a fixed order, with the variance of each pixel.
+
+How a sample is followed is `transport`, what it is followed through is `world`. A sample's random numbers are a
+function of (seed, pixel, number of the sample), and blocks of samples are the same whatever the number of threads, so
+a picture of so many samples is the same to the last bit for any number of threads.
+"""
+
+import math
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from tsdf import transport as T
+from tsdf.errors import UsageError
+from tsdf.transport import Camera
+from tsdf.world import World, camera_of
+
+SLOTS = 2048  # walkers under way at once, per thread, but for shadows: their state stays in the second-level cache
+ROOM = 4 * SLOTS
+BLOCK = 16384  # samples of a block, about
+PARTS = 16  # of the samples of a small picture, so that threads have something to share
+FEW = 16  # samples per pixel and block, at most, of large pictures
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A rendered picture and what it took.
+
+    Attributes
+    ----------
+    rgb : (h, w, 3) float64
+        Mean radiance, linear sRGB.
+    variance : (h, w, 3) float64
+        Of that mean, estimated from the samples; infinite with fewer than two.
+    samples : (h, w) int64
+        Samples of each pixel.
+    events, rays : int
+        Grains met, and rays traced in the scene.
+    seconds : float
+        Time spent on it.
+    truncated, faults : int
+        Paths given up because nothing let their light out, and rays that lost track of a surface.
+    interrupted : bool
+        Whether it is less than what was asked for because the user stopped it.
+    """
+
+    rgb: np.ndarray
+    variance: np.ndarray
+    samples: np.ndarray
+    events: int
+    rays: int
+    seconds: float
+    truncated: int
+    faults: int
+    interrupted: bool
+
+    @property
+    def relative_error(self) -> float:
+        """Standard error of pixels (root mean square) over the mean of the picture."""
+        mean = float(self.rgb.mean())
+        if not np.isfinite(self.variance).all() or mean <= 0.0:
+            return math.inf
+        return math.sqrt(float(self.variance.mean())) / mean
+
+
+class Walkers:
+    """What one thread needs to follow light through a world."""
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        engines, exemplars = len(world.place.engines), len(world.packed.engines)
+        self.walkers = [np.zeros(ROOM, T.WALKER) for _ in range(2)]
+        self.amounts = [np.zeros((ROOM, world.amounts)) for _ in range(2)]
+        self.hits = np.full((engines, ROOM), -1, np.int32)
+        self.grain_hits = np.full((exemplars, ROOM), -1, np.int32)
+        self.starts, self.ways = (np.zeros((ROOM, 3), np.float32) for _ in range(2))
+        self.grain_starts, self.grain_ways = (np.zeros((exemplars, ROOM, 3), np.float32) for _ in range(2))
+        self.asked = np.zeros(2 + exemplars, np.int64)
+        self.counters = np.zeros(4, np.int64)
+
+    def follow(
+        self, camera: Camera, pixel: int, pixels: int, spp: int, sample: int, seed: int, stop: threading.Event
+    ) -> np.ndarray:
+        """Return the radiance (pixels, spp, 3) of samples `sample` .. sample + spp - 1 of consecutive pixels.
+
+        Once `stop` is set it is worthless.
+        """
+        w = self.world
+        total = pixels * spp
+        radiance = np.zeros((total, 3))
+        first, live = 0, 0
+        while (live or first < total) and not stop.is_set():
+            if live <= SLOTS // 2 and first < total:
+                fresh = min(SLOTS - live, total - first)
+                T.spawn(first, fresh, pixel, spp, sample, seed, camera, self.walkers[0][live:], self.amounts[0][live:])
+                first, live = first + fresh, live + fresh
+            T.advance(
+                live, self.walkers[0], self.amounts[0], self.walkers[1], self.amounts[1], self.hits, self.grain_hits,
+                self.starts, self.ways, self.grain_starts, self.grain_ways, w.place.arrays, w.media, w.tables, w.lights,
+                w.packed.arrays, w.absorption, radiance, self.counters, self.asked,
+            )  # fmt: skip
+            live, rays = int(self.asked[T.LIVE]), int(self.asked[T.ASKED])
+            if rays:
+                w.place.hits(self.starts[:rays], self.ways[:rays], self.hits)
+            for e, asked in enumerate(self.asked[T.GRAINS_ASKED :]):
+                if asked:
+                    self.grain_hits[e, :asked] = w.packed.hits(
+                        e, self.grain_starts[e, :asked], self.grain_ways[e, :asked]
+                    )
+            self.walkers.reverse()
+            self.amounts.reverse()
+        return radiance.reshape(pixels, spp, 3)
+
+
+def render(
+    world: World,
+    spp: int | None = None,
+    seconds: float | None = None,
+    target_error: float | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Callable[[float, str], None] | None = None,
+    stop: threading.Event | None = None,
+) -> Picture:
+    """Return the picture that the scene's camera takes.
+
+    Parameters
+    ----------
+    world : World
+    spp : int, optional
+        Samples per pixel.
+    seconds : float, optional
+        Stop after this time; pixels then differ by a few samples.
+    target_error : float, optional
+        Stop when `Picture.relative_error` is below this.
+    seed : int
+        The same seed and number of samples give the same picture for any number of threads.
+    threads : int, optional
+        All processors by default.
+    progress : callable, optional
+        Called with the share done in [0, 1] and a word about it.
+    stop : Event, optional
+        Set by others to end early; the picture then holds the samples so far.
+    """
+    camera = world.scene.camera
+    return measure(
+        world, camera_of(world), camera.width, camera.height, spp, seconds, target_error, seed, threads, progress, stop
+    )
+
+
+def measure(
+    world: World,
+    camera: Camera,
+    width: int = 1,
+    height: int = 1,
+    spp: int | None = None,
+    seconds: float | None = None,
+    target_error: float | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Callable[[float, str], None] | None = None,
+    stop: threading.Event | None = None,
+) -> Picture:
+    """Return the picture that any camera takes, as `render` does for the scene's own; of a parallel beam, say."""
+    if spp is None and seconds is None and target_error is None:
+        raise UsageError("say when to stop: samples per pixel, seconds or a target error")
+    for name, value in (("spp", spp), ("seconds", seconds), ("target error", target_error)):
+        if value is not None and not 0 < value < math.inf:
+            raise UsageError(f"{name} must be a finite number above 0, not {value}")
+    threads = threads or os.cpu_count() or 1
+    stop = stop or threading.Event()
+    halt = threading.Event()
+    count = width * height
+    share = max(FEW, BLOCK // count) if seconds is None or count * FEW <= BLOCK else 4
+    if spp:
+        share = max(1, min(share, spp, max(spp // PARTS, BLOCK // (PARTS * count))))
+    step = max(1, BLOCK // share)
+    total, squares = np.zeros((count, 3)), np.zeros((count, 3))
+    samples = np.zeros(count, np.int64)
+    pool = [Walkers(world) for _ in range(threads)]
+    pool[0].follow(camera, 0, 1, 1, 0, seed, halt)  # compiles, outside the time
+    for walkers in pool:
+        walkers.counters[:] = 0
+    free = list(pool)
+    begin = time.perf_counter()
+
+    def job(pixel: int, pixels: int, number: int, sample: int) -> np.ndarray:
+        mine = free.pop()
+        try:
+            return mine.follow(camera, pixel, pixels, number, sample, seed, halt)
+        finally:
+            free.append(mine)
+
+    def picture(interrupted: bool) -> Picture:
+        n = np.maximum(samples, 1)[:, None]
+        mean = total / n
+        with np.errstate(invalid="ignore", divide="ignore"):
+            variance = np.where(n > 1, np.maximum(squares / n - mean**2, 0.0) / np.maximum(n - 1, 1), math.inf)
+        counters = np.sum([walkers.counters for walkers in pool], axis=0)
+        shape = (height, width, 3)
+        return Picture(
+            mean.reshape(shape), variance.reshape(shape), samples.reshape(height, width), int(counters[T.EVENTS]),
+            int(counters[T.RAYS]), time.perf_counter() - begin, int(counters[T.TRUNCATED]), int(counters[T.FAULTS]),
+            interrupted,
+        )  # fmt: skip
+
+    def share_done(done: float) -> float:
+        shares = [0.0]
+        if spp:
+            shares.append(done / spp)
+        if seconds:
+            shares.append((time.perf_counter() - begin) / seconds)
+        return min(1.0, max(shares))
+
+    def over() -> bool:
+        return stop.is_set() or (seconds is not None and time.perf_counter() - begin >= seconds)
+
+    def blocks() -> Iterator[tuple[int, int, int, int]]:
+        """Pixels, their number, samples, the number of the first, one block of samples after the other."""
+        done = 0
+        while spp is None or done < spp:
+            number = min(share, spp - done) if spp else share
+            for pixel in range(0, count, step):
+                yield pixel, min(step, count - pixel), number, done
+            done += number
+
+    coming = blocks()
+    waiting: deque[tuple[tuple[int, int, int, int], Future]] = deque()
+    with ThreadPoolExecutor(threads) as executor:
+        try:
+            while not over():
+                while len(waiting) < 2 * threads and (block := next(coming, None)):
+                    waiting.append((block, executor.submit(job, *block)))
+                if not waiting:
+                    break
+                (pixel, pixels, number, sample), future = waiting[0]
+                try:
+                    found = future.result(timeout=0.1)
+                except TimeoutError:
+                    continue
+                waiting.popleft()
+                total[pixel : pixel + pixels] += found.sum(axis=1)
+                squares[pixel : pixel + pixels] += (found**2).sum(axis=1)
+                samples[pixel : pixel + pixels] += number
+                if progress is not None:
+                    done = sample + number * (pixel + pixels) / count
+                    progress(share_done(done), f"{sample + number} spp")
+                whole = pixel + pixels == count and sample + number >= 2
+                if target_error is not None and whole and picture(False).relative_error <= target_error:
+                    break
+        except KeyboardInterrupt:
+            stop.set()
+        finally:
+            halt.set()
+    return picture(stop.is_set())

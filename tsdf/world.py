@@ -1,0 +1,299 @@
+"""A scene at one level of detail, as the arrays that `transport` follows light through.
+
+Here free paths, phase functions and absorption spectra become numbers per medium and component; how light uses them is
+`transport`, pictures are `render`. The levels, cheapest first: isotropic (point scatterers, similarity), volume-hg (one
+Henyey-Greenstein lobe), volume (tabulated deflections), teleport (Algorithm 1 of Meng et al. 2015), teleport-joint (its
+offsets kept together), explicit (packed grains, traced).
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tsdf import format, image
+from tsdf.errors import SceneError, TSDFError
+from tsdf.explicit import Packed, nothing_packed, packed
+from tsdf.geometry import Place, place
+from tsdf.grains import load_grain
+from tsdf.lights import LightArrays, compile_lights
+from tsdf.medium import Component, VolumeParameters, free_path, volume_parameters
+from tsdf.optics import Optics
+from tsdf.sampler import Tables, compile_tables
+from tsdf.scatterometer import Effort, exact_sphere
+from tsdf.scene import Absorption as AbsorptionSpec
+from tsdf.scene import (
+    Box,
+    ConstantLight,
+    EnvironmentLight,
+    GrainSpec,
+    MediumSpec,
+    Mesh,
+    Scene,
+    Slab,
+    SunLight,
+    absorption_at,
+)
+from tsdf.table import Table
+from tsdf.transport import (
+    EXPLICIT,
+    ISOTROPIC,
+    MODELS,
+    TELEPORT,
+    TELEPORT_JOINT,
+    VOLUME_HG,
+    Absorption,
+    Camera,
+    Media,
+)  # fmt: skip
+from tsdf.vectors import frame
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, ITU-R BT.709
+DARKEST = 1e-300  # albedo, so that it has a logarithm
+LONGEST_OFFSET = math.sqrt(8.0)  # [R] r and z drawn independently: at most 2 each
+
+
+@dataclass(eq=False)
+class World:
+    """What light meets in a scene at a level.
+
+    Attributes
+    ----------
+    scene : Scene
+    level : str
+    place : Place
+        Geometry and its ray engine.
+    packed : Packed
+        Grains of the explicit level.
+    media, tables, lights, absorption
+        Arrays for kernels.
+    amounts : int
+        How many amounts of matter a walker counts.
+    parameters : tuple of VolumeParameters
+        Of the media, at the luminance-weighted mean of their absorption.
+    notes : tuple of str
+        What the user should know, one line each.
+    """
+
+    scene: Scene
+    level: str
+    place: Place
+    packed: Packed
+    media: Media
+    tables: Tables
+    lights: LightArrays
+    absorption: Absorption
+    amounts: int
+    parameters: tuple[VolumeParameters, ...]
+    notes: tuple[str, ...]
+
+
+def camera_of(world: World) -> Camera:
+    """Return the pinhole camera of a scene for kernels, relative to the scene's centre."""
+    camera = world.scene.camera
+    position = np.array(camera.position) - world.place.centre
+    view = np.array(camera.target) - np.array(camera.position)
+    view /= np.linalg.norm(view)
+    right = np.cross(view, np.array(camera.up))
+    right /= np.linalg.norm(right)
+    down = np.cross(view, right)
+    pixel = 2.0 * math.tan(0.5 * math.radians(camera.fov_deg)) / camera.width
+    corner = view - 0.5 * pixel * (camera.width * right + camera.height * down)
+    still = (0.0, 0.0, 0.0)
+    return Camera(
+        _triple(position), still, still, _triple(corner), _triple(pixel * right), _triple(pixel * down), camera.width
+    )
+
+
+def beam(world: World, origin: ArrayLike, direction: ArrayLike, width: float = 0.0) -> Camera:
+    """Return a camera whose one pixel is a parallel beam, a square of given width about `origin` [unit]."""
+    d = np.asarray(direction, np.float64) / np.linalg.norm(direction)
+    a, b = (width * np.array(v) for v in frame(_triple(d)))
+    start = np.asarray(origin, np.float64) - world.place.centre - 0.5 * (a + b)
+    still = (0.0, 0.0, 0.0)
+    return Camera(_triple(start), _triple(a), _triple(b), _triple(d), still, still, 1)
+
+
+def _triple(v: np.ndarray) -> tuple[float, float, float]:
+    return float(v[0]), float(v[1]), float(v[2])
+
+
+def build(scene: Scene, level: str) -> World:
+    """Return a scene ready to be rendered at a level.
+
+    Raises
+    ------
+    SceneError, FormatError, UsageError
+        In one line, for whatever makes the scene impossible at that level.
+    """
+    if level not in MODELS:
+        raise SceneError(f"{scene.name}: no level {level!r}; levels are {', '.join(MODELS)}")
+    model = MODELS[level]
+    read: dict[Path, Table] = {}
+
+    def table_of(spec: GrainSpec) -> Table:
+        if isinstance(spec.table, Table):
+            return spec.table
+        if spec.table not in read:
+            read[spec.table] = format.read(spec.table)
+        return read[spec.table]
+
+    tables = [table_of(grain) for medium in scene.media for grain in medium.grains]
+    made = place(scene)
+    notes = list(made.notes)
+    media, absorption, parameters = _media(scene, model, tables)
+    if model == TELEPORT_JOINT:
+        for grain, table in zip((g for m in scene.media for g in m.grains), tables, strict=True):
+            if not table.joint:
+                raise SceneError(
+                    f"{scene.name}: {grain.table} has no joint records, which level teleport-joint draws from; "
+                    "build it with --joint 32"
+                )
+    for number, (medium, boundary) in enumerate(zip(scene.media, made.boundaries, strict=True), 1):
+        extent = _extent(medium, boundary.vertices if boundary is not None else None)
+        if 2.0 * medium.radius > extent:
+            notes.append(
+                f"{scene.name}: [[medium]] {number} ({medium.name}): a grain of diameter {2.0 * medium.radius:g} does "
+                f"not fit into the medium, which is {extent:.3g} thin"
+            )
+    grains = packed(scene, made, tables) if model == EXPLICIT else nothing_packed(len(scene.media), len(tables))
+    return World(
+        scene=scene,
+        level=level,
+        place=made,
+        packed=grains,
+        media=media,
+        tables=compile_tables(tables or [_no_table()], joint=model == TELEPORT_JOINT),
+        lights=_lights(scene),
+        absorption=absorption,
+        amounts=len(absorption.least),
+        parameters=parameters,
+        notes=(*notes, *grains.notes),
+    )
+
+
+def _extent(medium: MediumSpec, vertices: np.ndarray | None) -> float:
+    """Return the smallest extent of a medium along the axes."""
+    shape = medium.shape
+    if isinstance(shape, Slab):
+        return shape.high - shape.low
+    if isinstance(shape, Box):
+        return float((np.array(shape.high) - np.array(shape.low)).min())
+    if isinstance(shape, Mesh):
+        assert vertices is not None
+        return float(np.ptp(vertices, axis=0).min())
+    return 2.0 * shape.radius
+
+
+def _no_table() -> Table:
+    """Return a table for scenes without media, whose kernels want one."""
+    return exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=8))
+
+
+def _lights(scene: Scene) -> LightArrays:
+    constant, suns, environment, rotation = np.zeros(3), [], None, 0.0
+    for light in scene.lights:
+        if isinstance(light, ConstantLight):
+            constant += light.radiance
+        elif isinstance(light, SunLight):
+            suns.append((light.direction, light.angular_diameter_deg, light.irradiance))
+        elif isinstance(light, EnvironmentLight):
+            if environment is not None:
+                raise SceneError(f"{scene.name}: more than one environment light; add the images into one file")
+            environment, rotation = image.read_environment(light.file) * light.scale, light.rotation_deg
+    try:
+        return compile_lights(constant, environment, rotation, suns)
+    except TSDFError as error:
+        raise SceneError(f"{scene.name}: {error}") from None
+
+
+def _spectra(spec: AbsorptionSpec, metres_per_unit: float | None) -> tuple[np.ndarray | None, np.ndarray]:
+    """Return the absorption coefficient by wavelength (k,) or None, and by channel (3,), zero where by wavelength."""
+    if spec.kind == "grey":
+        return None, np.full(3, spec.coefficient[0])
+    if spec.kind == "rgb":
+        return None, np.array(spec.coefficient)
+    return absorption_at(spec, image.spectral_weights().wavelength_nm, metres_per_unit), np.zeros(3)
+
+
+def _media(scene: Scene, model: int, tables: list[Table]) -> tuple[Media, Absorption, tuple[VolumeParameters, ...]]:
+    """Return media, absorption and volume parameters, with amounts only for what absorbs."""
+    specs = [(medium, grain) for medium in scene.media for grain in medium.grains]
+    spectra = [_spectra(grain.absorption, scene.metres_per_unit) for _, grain in specs]
+    coloured = any(by_wavelength is not None for by_wavelength, _ in spectra)
+    weight = image.spectral_weights().weight if coloured else np.zeros((0, 3))
+    absorbs = [by_channel.any() or (s is not None and s.any()) for s, by_channel in spectra]
+
+    free, reach, first, kinds, travel, parameters = [], [], [], [], [], []
+    choice, scale, slots, g = [], [], [], []
+    columns: list[tuple[np.ndarray, np.ndarray]] = []  # exponents by wavelength and by channel of each amount
+
+    def amount(by_wavelength: np.ndarray | None, by_channel: np.ndarray) -> int:
+        columns.append((np.zeros(len(weight)) if by_wavelength is None else by_wavelength, by_channel))
+        return len(columns) - 1
+
+    at = 0
+    for medium in scene.media:
+        these = range(at, at + len(medium.grains))
+        components = [Component(tables[i], specs[i][1].fraction, medium.radius) for i in these]
+        grey = [
+            float(LUMINANCE @ (by_channel if s is None else weight.T @ s))
+            for s, by_channel in (spectra[i] for i in these)
+        ]
+        path = free_path(components, medium.packing_fraction)
+        volume = volume_parameters(components, medium.packing_fraction, grey)
+        parameters.append(volume)
+        first.append(at)
+        kinds.append(len(components))
+        choice += list(np.cumsum(path.choice))
+        g += [volume.g] * len(components)
+        if model == ISOTROPIC:
+            free.append(1.0 / (volume.sigma_t * (1.0 - volume.g)))
+        else:
+            free.append(path.lambda_beta if model in (TELEPORT, TELEPORT_JOINT, EXPLICIT) else 1.0 / volume.sigma_t)
+        reach.append(LONGEST_OFFSET * medium.radius if model in (TELEPORT, TELEPORT_JOINT) else 0.0)
+        flown_wavelength, flown_channel = np.zeros(len(weight)), np.zeros(3)
+        for i, probability in zip(these, path.choice, strict=True):
+            scale.append(1.0 if model in (VOLUME_HG, ISOTROPIC) else medium.radius)
+            if not absorbs[i]:
+                slots.append(-1)
+                continue
+            by_wavelength, by_channel = spectra[i]
+            if model in (VOLUME_HG, ISOTROPIC):
+                lossless = tables[i].albedo()
+                spectrum = np.zeros(0) if by_wavelength is None else by_wavelength
+                kept = [
+                    np.array([max(tables[i].albedo(s * medium.radius) / lossless, DARKEST) for s in values])
+                    for values in (spectrum, by_channel)
+                ]
+                slots.append(amount(np.log(kept[0]) if by_wavelength is not None else None, np.log(kept[1])))
+                if by_wavelength is not None:
+                    flown_wavelength -= probability * volume.sigma_t * volume.g * (1.0 - kept[0])
+                flown_channel -= probability * volume.sigma_t * volume.g * (1.0 - kept[1])
+            else:
+                slots.append(amount(None if by_wavelength is None else -by_wavelength, -by_channel))
+        absorbing = any(absorbs[i] for i in these)
+        travel.append(amount(flown_wavelength, flown_channel) if model == ISOTROPIC and absorbing else -1)
+        at += len(components)
+    spectral = np.array([c[0] for c in columns]).T.reshape(len(weight), len(columns))
+    rgb = np.array([c[1] for c in columns]).T.reshape(3, len(columns))
+    least = rgb.max(axis=0) + (spectral.max(axis=0) if len(weight) else 0.0)
+    media = Media(
+        model=model,
+        free=np.array(free),
+        reach=np.array(reach),
+        first=np.array(first, np.int64),
+        kinds=np.array(kinds, np.int64),
+        travel=np.array(travel, np.int64),
+        choice=np.array(choice),
+        scale=np.array(scale),
+        slot=np.array(slots, np.int64),
+        g=np.array(g),
+    )
+    absorption = Absorption(
+        spectral=np.ascontiguousarray(spectral), rgb=np.ascontiguousarray(rgb), weight=np.ascontiguousarray(weight),
+        least=np.ascontiguousarray(least),
+    )  # fmt: skip
+    return media, absorption, tuple(parameters)
