@@ -21,8 +21,7 @@ from tsdf.scene import Box, MediumSpec, Mesh, Rectangle, Scene, Slab, Sphere, Su
 from tsdf.vectors import dot, step
 
 SLACK = 2e-6  # [of a facet's largest coordinate] a point this near to a facet is on it: 30 float32 ulps
-FIELD_CELLS = 300_000  # of the grid of distances: half a second to make
-SAMPLES = 4096  # points at most that stand for one triangle; larger triangles are measured exactly
+FIELD_CELLS = 2_000_000  # of the grid of distances: half a second to make
 LEAST_OVERLAP = 1e-3  # [of the smaller extent] media that overlap by less only touch
 MESH, SLAB, BOX, BALL = 0, 1, 2, 3  # kinds of boundaries
 NONE = -1
@@ -414,45 +413,49 @@ def _field(
     h = float((size.prod() / FIELD_CELLS) ** (1 / 3))
     counts = np.ceil(size / h).astype(int) + 2
     low = 0.5 * (low + high) - 0.5 * counts * h
-    centres = np.stack(
-        np.meshgrid(*(low[k] + h * (np.arange(counts[k]) + 0.5) for k in range(3)), indexing="ij"), axis=-1
-    ).reshape(-1, 3)
-    corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
-    found = distances(corners, centres, 0.25 * h)
-    return found.reshape(counts).astype(np.float32), low, h, endless
+    return distances(np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]), low, h, counts), low, h, endless
 
 
-def distances(corners: np.ndarray, points: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return (n,) float64 lower bounds, short by at most `tolerance` or so, of distances from points to triangles.
+def distances(corners: np.ndarray, low: np.ndarray, step: float, counts: Sequence[int]) -> np.ndarray:
+    """Return float32 lower bounds of the distances of the cells' centres of a grid to the triangles that reach into it.
+
+    They are short by less than two cells' diagonals.
 
     Parameters
     ----------
     corners : (m, 3, 3) float64
         Of the triangles.
-    points : (n, 3) float64
-    tolerance : float
-        Triangles are stood for by points this far apart, but for those that would need more than `SAMPLES`.
+    low : (3,) float64
+        Corner of the grid.
+    step : float
+        Edge of its cells.
+    counts : (3,) int
+        How many along each axis.
     """
-    from scipy.spatial import cKDTree
+    from scipy.ndimage import distance_transform_edt
 
-    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    parts = np.maximum(np.ceil(edges / tolerance).astype(np.int64), 1)
-    large = parts**2 > SAMPLES
-    nearest = np.full(len(points), math.inf)
-    samples = []
-    for n in np.unique(parts[~large]):  # centroids of n^2 like parts of each triangle
-        i, j = np.divmod(np.arange(n * n), n)
-        up = i + j < n
-        a, b = np.where(up, i + 1 / 3, n - i - 1 / 3) / n, np.where(up, j + 1 / 3, n - j - 1 / 3) / n
-        of = corners[~large & (parts == n)]
-        weights = np.stack((1 - a - b, a, b))
-        samples.append(np.einsum("kp,tkx->tpx", weights, of).reshape(-1, 3))
-    if samples:
-        reach = 2 / 3 * float((edges / parts)[~large].max())  # no point of a part is farther from its centroid
-        nearest = np.maximum(cKDTree(np.concatenate(samples)).query(points, workers=-1)[0] - reach, 0.0)
-    if large.any():
-        exact_distances(np.ascontiguousarray(corners[large]), points, nearest)
-    return nearest
+    high = low + step * np.asarray(counts)
+    free = np.ones(tuple(counts), bool)
+    while len(corners):
+        least, most = corners.min(axis=1), corners.max(axis=1)
+        corners = corners[((most >= low) & (least <= high)).all(axis=1)]
+        edges = np.stack([np.linalg.norm(corners[:, i] - corners[:, i - 1], axis=1) for i in range(3)], axis=1)
+        small = edges.max(axis=1, initial=0.0) <= step
+        ends = [np.floor((extreme(corners[small], axis=1) - low) / step).astype(int) for extreme in (np.min, np.max)]
+        for choice in np.ndindex(2, 2, 2):  # a triangle no longer than a cell lies in at most eight
+            cell = np.stack([ends[choice[k]][:, k] for k in range(3)])
+            cell = cell[:, ((cell >= 0) & (cell < np.asarray(counts)[:, None])).all(axis=0)]
+            free[tuple(cell)] = False
+        # The others are cut across their longest edge
+        corners, longest = corners[~small], edges[~small].argmax(axis=1)
+        row = np.arange(len(corners))
+        a, b, c = (corners[row, (longest + k) % 3] for k in (-1, 0, 1))
+        middle = 0.5 * (a + b)
+        corners = np.concatenate((np.stack((a, middle, c), axis=1), np.stack((middle, b, c), axis=1)))
+    if free.all():
+        return np.full(tuple(counts), step * math.hypot(*counts), np.float32)
+    bounds = distance_transform_edt(free, sampling=step) - math.sqrt(0.75) * step
+    return np.maximum(bounds, 0.0).astype(np.float32)
 
 
 @njit(cache=True)
@@ -476,15 +479,6 @@ def triangle_distance(corners, p):
         w = step(w, -min(max(dot(w, e) / dot(e, e), 0.0), 1.0), e)
         best = min(best, dot(w, w))
     return math.sqrt(best)
-
-
-@njit(cache=True)
-def exact_distances(corners, points, nearest):
-    """Lower (n,) `nearest` to the distances of points (n, 3) to any of the triangles (m, 3, 3)."""
-    for i in range(points.shape[0]):
-        p = (points[i, 0], points[i, 1], points[i, 2])
-        for t in range(corners.shape[0]):
-            nearest[i] = min(nearest[i], triangle_distance(corners[t], p))
 
 
 def _no_overlap(made: Place, scene: Scene) -> None:
