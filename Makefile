@@ -13,16 +13,34 @@ help:  ## list the targets
 
 install: .venv/installed  ## make the virtual environment .venv with everything in it
 
-demo: .venv/installed  ## build a sphere and a snow grain, validate both, plot them into demo/
+demo: .venv/installed  ## build tables, validate and plot them, render the scenes small, all into demo/
 	mkdir -p demo
 	$(BIN)/tsdf-build sphere --eta 1.33 --joint 32 --out demo/sphere.tsdf.exr
 	$(BIN)/tsdf-build sphere --eta 1.333 --fresnel sp --out demo/zhou2003.tsdf.exr --quiet
 	$(BIN)/tsdf-build snow --target-error 0.01 --joint 32 --out demo/snow.tsdf.exr
+	$(BIN)/tsdf-build sand --material quartz --target-error 0.02 --joint 32 --out demo/sand.tsdf.exr --quiet
+	$(BIN)/tsdf-build ellipsoid --set subdivisions=4 --material quartz --target-error 0.02 --joint 32 --out demo/clear.tsdf.exr --quiet
+	$(BIN)/tsdf-build sphere --eta 1.5 --joint 32 --out demo/glass.tsdf.exr --quiet
 	$(BIN)/tsdf-plot demo/sphere.tsdf.exr --out demo/sphere.png
 	$(BIN)/tsdf-plot demo/snow.tsdf.exr --out demo/snow.png
 	$(BIN)/tsdf-validate demo/zhou2003.tsdf.exr --plot demo/zhou2003.png
-	$(BIN)/tsdf-validate demo/sphere.tsdf.exr demo/snow.tsdf.exr
-	@echo "tables and plots are in demo/"
+	$(BIN)/tsdf-validate demo/sphere.tsdf.exr demo/snow.tsdf.exr demo/sand.tsdf.exr demo/clear.tsdf.exr demo/glass.tsdf.exr
+	$(MAKE) --no-print-directory pictures INTO=demo WIDTH=320 SECONDS=20
+	@echo "tables, plots and pictures are in demo/"
+
+gallery: demo  ## render the scenes large into gallery/; SECONDS=900 is the time for each picture
+	mkdir -p gallery
+	$(MAKE) --no-print-directory pictures INTO=gallery WIDTH=1280 SECONDS=$(or $(SECONDS),900)
+
+pictures:
+	$(BIN)/python scenes/make_assets.py
+	$(BIN)/tsdf-render scenes/snow.toml --out $(INTO)/snow_heap.exr --width $(WIDTH) --seconds $(SECONDS)
+	$(BIN)/tsdf-render scenes/sand.toml --out $(INTO)/sand_dune.exr --width $(WIDTH) --seconds $(SECONDS)
+	for level in explicit teleport volume; do \
+		$(BIN)/tsdf-render scenes/beads.toml --level $$level --out $(INTO)/beads_$$level.exr --width $(WIDTH) \
+			--seconds $(SECONDS) || exit; done
+	$(BIN)/python scenes/side_by_side.py $(INTO)/beads_explicit.exr $(INTO)/beads_teleport.exr \
+		$(INTO)/beads_volume.exr $(INTO)/beads.png
 
 test: .venv/installed  ## run the tests
 	$(BIN)/python -m pytest
@@ -35,4 +53,4 @@ check: .venv/installed  ## style and types
 bench: .venv/installed  ## measure speed and error side by side, into bench/
 	$(BIN)/python benchmarks/bench.py
 
-.PHONY: help install demo test check bench
+.PHONY: help install demo gallery pictures test check bench

@@ -2,6 +2,7 @@
 
 import json
 import signal
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -76,10 +77,10 @@ def main(
         spp = read.render.spp
     seed = read.render.seed if seed is None else seed
 
-    def stop(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, stop)
+    # A flag, for signals come twice (timeout sends them to the process and to its group) and the second is no other
+    stop = threading.Event()
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda *_: stop.set()) for number in signals]
     form = "{percentage:3.0f}% |{bar}| {postfix} [{elapsed}<{remaining}]"
     try:
         with tqdm(total=1.0, disable=quiet, bar_format=form, dynamic_ncols=True) as bar:
@@ -88,10 +89,14 @@ def main(
                 bar.set_postfix_str(word, refresh=False)
                 bar.update(share - bar.n)
 
-            picture = render.render(made, spp, seconds, target_error, seed, threads, progress)
+            picture = render.render(made, spp, seconds, target_error, seed, threads, progress, stop)
+        if not picture.samples.any():
+            click.echo("interrupted before the first sample: nothing is written", err=True)
+            return 130
+        save(made, picture, seed, out)
     finally:
-        signal.signal(signal.SIGTERM, before)
-    save(made, picture, seed, out)
+        for number, handler in zip(signals, before, strict=True):
+            signal.signal(number, handler)
     if not quiet or picture.interrupted:
         summary(made, picture, out)
     return 130 if picture.interrupted else 0

@@ -22,7 +22,7 @@ from tsdf.packing import Cells, cells_of, next_sphere, pack
 from tsdf.sampling import key_of, mix, turn, unit
 from tsdf.scene import GrainSpec, MediumSpec, Scene
 from tsdf.table import Table
-from tsdf.vectors import dot, step
+from tsdf.vectors import KERNEL, dot, step
 
 OFFSET = 1e-5  # [R] restart distance off a facet along its normal, as in `tracer`
 RETRY = 1e-3  # share of the way to the facet's centroid by which a failed restart is moved
@@ -63,7 +63,7 @@ class Grains(NamedTuple):
 # ------------------------------------------------------------------------------------------- for kernels
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def centre_of(grains, m, i, j, k, sphere):
     """Return the centre of a sphere of tile (i, j, k) of medium m [unit]."""
     side, c, radius = grains.cells[m].side, grains.centres[m], grains.radius[m]
@@ -74,7 +74,7 @@ def centre_of(grains, m, i, j, k, sphere):
     )
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def exists(grains, g, m, i, j, k, sphere):
     """Return whether there is a grain in a sphere of tile (i, j, k) of medium m."""
     status, block = grains.status[m], grains.block[m]
@@ -88,7 +88,7 @@ def exists(grains, g, m, i, j, k, sphere):
     return exact_depth(g.kind[m], g.shape[m], centre) >= grains.radius[m]
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def next_grain(grains, g, m, p, d, t_max):
     """Return distance to the next grain's bounding sphere along d from p [unit] or infinity, its centre and its key."""
     r = grains.radius[m]
@@ -103,7 +103,7 @@ def next_grain(grains, g, m, p, d, t_max):
             return t * r, centre_of(grains, m, i, j, k, sphere), mix(tile + np.uint64(sphere))
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def turned(key, v, back):
     """Return a triple turned by the uniformly random rotation (Shoemake 1992) of a grain's key, or turned back."""
     u = unit(mix(key + np.uint64(1)))
@@ -123,7 +123,7 @@ def turned(key, v, back):
     )
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def component_of(grains, first, count, key):
     """Return the component of a grain, by number fraction."""
     u = unit(mix(key + np.uint64(4)))
@@ -133,7 +133,7 @@ def component_of(grains, first, count, key):
     return c
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**KERNEL)
 def through_sphere(p, d, eta, kept_apart, key):
     """Follow light that meets the unit sphere at p until it leaves; return place, direction, length inside, key."""
     cos_i = min(-dot(p, d), 1.0)
@@ -159,16 +159,15 @@ def through_sphere(p, d, eta, kept_apart, key):
         d = step(d, -2.0 * dot(d, p), p)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**KERNEL)
 def at_facet(planes, centroids, facet, last, p, d, eta, state, key):
     """Take light at p along d in a grain's frame to the facet that the ray engine found, -1 for none, and on.
 
     Returns
     -------
-    p, d : triples
-        On the facet (moved off it along its normal) and the way it goes on.
-    start : triple
-        Where the next ray starts: `p`, or elsewhere if the ray must be repeated.
+    start, d : triples
+        Where the next ray starts, off the facet along its normal, and the way the light goes on. With RETRIED the same
+        ray is to be repeated from there, and `p` stays what it was.
     length : float
         Travelled inside [R].
     facet : int
@@ -211,7 +210,7 @@ def at_facet(planes, centroids, facet, last, p, d, eta, state, key):
     return step(p, -OFFSET if inside else OFFSET, n), d, length, facet, INSIDE if inside else 0, key, False
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def rim_of(p, d):
     """Return the distance along d from p to the unit sphere, from within."""
     along = dot(p, d)
@@ -302,7 +301,7 @@ def packed(scene: Scene, place: Place, tables: Sequence[Table]) -> Packed:
             raise SceneError(f"{where}: {error}") from None
         cells.append(cells_of(packing))
         centres.append(np.ascontiguousarray(packing.centres))
-        notes.append(f"{medium.name}: {len(packing.centres)} spheres in a tile of {packing.side:.4g} R, "
+        notes.append(f"{where}: {len(packing.centres)} spheres in a tile of {packing.side:.4g} R, "
                      f"packing fraction {packing.fraction:.6f}")  # fmt: skip
         a, b, c = _existing(medium, m, place, packing.centres, packing.side, scene, where)
         status.append(a)
@@ -482,7 +481,7 @@ def clear(
     return result
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def any_nearer(corners, points, first, candidates, radius, result):
     """Set `result` to False for points nearer than `radius` to one of their candidate triangles."""
     for i in range(points.shape[0]):

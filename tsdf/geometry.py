@@ -18,7 +18,7 @@ from numba import njit
 from tsdf.errors import GrainError, SceneError
 from tsdf.grains import first_hit, grain_from_mesh, read_mesh, triangle_scene
 from tsdf.scene import Box, MediumSpec, Mesh, Rectangle, Scene, Slab, Sphere, SurfaceSpec
-from tsdf.vectors import dot, step
+from tsdf.vectors import KERNEL, cross, dot, step
 
 SLACK = 2e-6  # [of a facet's largest coordinate] a point this near to a facet is on it: 30 float32 ulps
 FIELD_CELLS = 2_000_000  # of the grid of distances: half a second to make
@@ -59,7 +59,7 @@ class Geometry(NamedTuple):
 # ------------------------------------------------------------------------------------------- for kernels
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def facet_hit(planes, facet, p, d):
     """Return distance along d from p to a facet's plane, and the cosine of d to its normal."""
     n = (planes[facet, 0], planes[facet, 1], planes[facet, 2])
@@ -69,7 +69,7 @@ def facet_hit(planes, facet, p, d):
     return (planes[facet, 3] - dot(n, p)) / cosine, cosine
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**KERNEL)
 def exact_hit(kind, shape, p, d):
     """Return distance to a slab, box or ball, whether p is inside, and the outward normal there."""
     if kind == BALL:
@@ -111,7 +111,7 @@ def exact_hit(kind, shape, p, d):
     return (far if inside else near), inside, n
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def ball_hit(balls, p, d):
     """Return distance to the nearest of the opaque balls and its number, or infinity and -1."""
     nearest, which = math.inf, NONE
@@ -130,7 +130,7 @@ def ball_hit(balls, p, d):
     return nearest, which
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def exact_depth(kind, shape, p):
     """Return the distance of p to a slab's, box's or ball's boundary, positive inside; outside a box at most that."""
     if kind == BALL:
@@ -142,7 +142,7 @@ def exact_depth(kind, shape, p):
     return depth
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def clearance(g, m, p):
     """Return a length within which p of medium m is sure to have neither its boundary nor a surface around it."""
     bound = math.inf
@@ -458,7 +458,7 @@ def distances(corners: np.ndarray, low: np.ndarray, step: float, counts: Sequenc
     return np.maximum(bounds, 0.0).astype(np.float32)
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def triangle_distance(corners, p):
     """Return the distance of p to a triangle (3, 3)."""
     a = (corners[0, 0], corners[0, 1], corners[0, 2])
@@ -468,10 +468,9 @@ def triangle_distance(corners, p):
     uu, uv, vv, qu, qv = dot(u, u), dot(u, v), dot(v, v), dot(q, u), dot(q, v)
     det = uu * vv - uv * uv
     s, t = vv * qu - uv * qv, uu * qv - uv * qu
-    if s >= 0.0 and t >= 0.0 and s + t <= det:
-        w = step(step(q, -s / det, u), -t / det, v)
-        return math.sqrt(dot(w, w))
-    best = math.inf
+    n, best = cross(u, v), math.inf
+    if s >= 0.0 and t >= 0.0 and s + t <= det and det > 0.0:
+        best = dot(q, n) ** 2 / dot(n, n)  # of a needle, s and t are mostly rounding: its edges count in any case
     for k in range(3):
         o = a if k < 2 else step(a, 1.0, u)
         e = u if k == 0 else (v if k == 1 else step(v, -1.0, u))

@@ -4,8 +4,9 @@ z is up. A `direction` is a unit triple that points toward the light, the way a 
 scene. Row 0 of an environment is the zenith (+z), its last row the nadir; its columns begin at azimuth 0 (+x) and go
 toward +y (azimuth 90 degrees at a quarter of the width); `rotation_deg` adds to the azimuth. Pixels are constant.
 
-Environment and suns are drawn in proportion to the luminance they send, so the density is luminance / power
-everywhere, whatever overlaps. The constant is never drawn. Reading image files is `image`.
+Suns are drawn in proportion to the luminance they send, the environment to that above a multiple of its mean; the
+density is the sum of both over their power, whatever overlaps. The constant is never drawn. Reading image files is
+`image`.
 """
 
 import math
@@ -18,9 +19,10 @@ from numba import njit
 
 from tsdf.errors import UsageError
 from tsdf.sampling import turn
-from tsdf.vectors import frame, step
+from tsdf.vectors import KERNEL, frame, step
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # [1] of linear sRGB, IEC 61966-2-1
+CONTRAST = 4.0  # times the mean luminance of an environment that need not be aimed at
 SMALLEST_DEG = 1e-6  # below, a disc is no wider than the rounding of directions
 
 Sun = tuple[npt.ArrayLike, float, npt.ArrayLike]
@@ -33,13 +35,14 @@ class LightArrays(NamedTuple):
     environment: np.ndarray  # (h, w, 3) radiance, h = 0 where there is none
     rotation: float  # [turns] azimuth of the left edge of column 0
     cos_edges: np.ndarray  # (h + 1,) cosine of the polar angle of the rows' edges, from 1 to -1
-    rows: np.ndarray  # (h,) running sum of luminance times cosine difference
-    columns: np.ndarray  # (h, w) running sum of luminance along each row
+    aim: np.ndarray  # (h, w) by how much each pixel is aimed at [luminance]
+    rows: np.ndarray  # (h,) running sum of `aim` times cosine difference
+    columns: np.ndarray  # (h, w) running sum of `aim` along each row
     sun_direction: np.ndarray  # (n, 3) toward the centre of each sun
     sun_chord2: np.ndarray  # (n,) squared distance of centre and edge of the disc on the unit sphere
     sun_radiance: np.ndarray  # (n, 3)
     shares: np.ndarray  # (n + 1,) running sum of the probability to draw the environment, then each sun
-    power: float  # luminance of environment and suns, integrated over directions
+    power: float  # `aim` and luminance of suns, integrated over directions
     sampled: bool  # whether there is anything to draw
 
 
@@ -48,6 +51,7 @@ def compile_lights(
     environment: npt.ArrayLike | None = None,
     rotation_deg: float = 0.0,
     suns: Sequence[Sun] = (),
+    contrast: float = CONTRAST,
 ) -> LightArrays:
     """Return the lights of a scene for the kernels of this module.
 
@@ -62,6 +66,10 @@ def compile_lights(
     suns : sequence of (direction, angular_diameter_deg, irradiance)
         Discs of uniform radiance: a vector toward the centre, of any length; the diameter [degrees], in [1e-6, 180];
         the linear-sRGB irradiance on a surface that faces it, >= 0.
+    contrast : float
+        `draw` aims at pixels of the environment in proportion to their luminance less so many times its mean. What is
+        not aimed at is found by chance, which is better for a broad sky: half of the variance and of the time went
+        into aiming at it.
 
     Raises
     ------
@@ -77,8 +85,10 @@ def compile_lights(
     height, width = pixels.shape[:2]
     cos_edges = np.cos(np.linspace(0.0, math.pi, height + 1))
     luminance = pixels @ LUMINANCE
-    with np.errstate(over="ignore"):  # judged below, by the power
-        columns = np.cumsum(luminance, axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):  # judged below, by the power
+        brightness = float(np.sum(-np.diff(cos_edges)[:, None] * luminance)) / (2.0 * width) if height else 0.0
+        aim = np.maximum(luminance - contrast * brightness, 0.0)
+        columns = np.cumsum(aim, axis=1)
         rows = np.cumsum(-np.diff(cos_edges) * columns[:, -1]) if height else np.zeros(0)
         discs = [_disc(number, *sun) for number, sun in enumerate(suns, 1)]
         direction, chord2, radiance = (np.array([disc[i] for disc in discs]) for i in range(3))
@@ -86,9 +96,9 @@ def compile_lights(
         environment_power = rows[-1] * 2.0 * math.pi / width if height else 0.0
         powers = np.append(environment_power, math.pi * chord2 * (radiance @ LUMINANCE))
     power = float(powers.sum())
-    if not math.isfinite(power):
+    if not (math.isfinite(power) and math.isfinite(brightness)):
         raise UsageError("the lights are too bright for the range of numbers; scale them down")
-    if not (power > 0.0 or any(everywhere)):
+    if not (power > 0.0 or any(everywhere) or luminance.any()):
         raise UsageError("a scene without light: every light is black; give one a radiance or irradiance above 0")
     shares = np.cumsum(powers)
     return LightArrays(
@@ -96,6 +106,7 @@ def compile_lights(
         environment=pixels,
         rotation=math.fmod(rotation_deg, 360.0) / 360.0,
         cos_edges=cos_edges,
+        aim=aim,
         rows=rows,
         columns=columns,
         sun_direction=direction,
@@ -141,11 +152,11 @@ def _disc(
     return centre / np.linalg.norm(centre), 4.0 * math.sin(0.5 * half) ** 2, colour / (math.pi * math.sin(half) ** 2)
 
 
-@njit(cache=True, inline="always")  # as a call, it would count references to each array: twice the time
+@njit(inline="always", **KERNEL)  # as a call, it would count references to each array: twice the time
 def _sent(lights, direction):
     """Return the radiance of environment and suns, and the density with which `draw` makes a direction [1/sr]."""
     x, y, z = direction
-    r = g = b = 0.0
+    r = g = b = density = 0.0
     height = lights.environment.shape[0]
     if height > 0:
         width = lights.environment.shape[1]
@@ -155,25 +166,25 @@ def _sent(lights, direction):
         r = lights.environment[row, column, 0]
         g = lights.environment[row, column, 1]
         b = lights.environment[row, column, 2]
+        density = lights.aim[row, column]
     for i in range(lights.sun_chord2.size):
         dx, dy, dz = x - lights.sun_direction[i, 0], y - lights.sun_direction[i, 1], z - lights.sun_direction[i, 2]
         if dx * dx + dy * dy + dz * dz < lights.sun_chord2[i]:  # a cosine could not tell small discs apart
             r += lights.sun_radiance[i, 0]
             g += lights.sun_radiance[i, 1]
             b += lights.sun_radiance[i, 2]
-    density = 0.0
-    if lights.sampled:
-        density = (LUMINANCE[0] * r + LUMINANCE[1] * g + LUMINANCE[2] * b) / lights.power
-    return r, g, b, density
+            for k in range(3):
+                density += LUMINANCE[k] * lights.sun_radiance[i, k]
+    return r, g, b, density / lights.power if lights.sampled else 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit(**KERNEL)
 def pdf(lights, direction):
     """Return the density with which `draw` makes a direction, 0 where nothing is drawn [1/sr]."""
     return _sent(lights, direction)[3]
 
 
-@njit(cache=True, nogil=True)
+@njit(**KERNEL)
 def radiance(lights, direction, weight_pdf):
     """Return the radiance from a direction as linear sRGB, with its weight against `draw` (balance heuristic).
 
@@ -194,7 +205,7 @@ def radiance(lights, direction, weight_pdf):
     return lights.constant[0] + weight * r, lights.constant[1] + weight * g, lights.constant[2] + weight * b
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def _cell(sums, x):
     """Return the cell of a running sum that x lies in, and how far in it, in [0, 1]; never an empty cell."""
     i = min(np.searchsorted(sums, x, side="right"), sums.size - 1)
@@ -202,7 +213,7 @@ def _cell(sums, x):
     return i, (x - low) / (sums[i] - low)
 
 
-@njit(cache=True, nogil=True)
+@njit(**KERNEL)
 def draw(lights, u0, u1, u2):
     """Return a direction toward environment or suns, its density and the radiance from there without the constant.
 
@@ -240,6 +251,6 @@ def draw(lights, u0, u1, u2):
         c, d = turn(u2)
         direction = step(step(step(centre, -drop, centre), rho * c, s), rho * d, t)
     r, g, b, density = _sent(lights, direction)
-    if density <= 0.0:  # rounding can carry an edge into the dark beside it, where r, g, b are 0
-        density = 1.0
+    if density <= 0.0:  # rounding can carry an edge to where nothing is drawn
+        return direction, 1.0, (0.0, 0.0, 0.0)
     return direction, density, (r, g, b)

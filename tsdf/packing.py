@@ -19,6 +19,7 @@ from numba import njit
 from tsdf.errors import TSDFError, UsageError
 from tsdf.files import replacing
 from tsdf.sampling import key_of, mix, unit
+from tsdf.vectors import KERNEL
 
 MAX = 0.625  # volume fraction; random starts jam at about 0.64 (O'Hern et al. 2003)
 MIN_SPHERES = 64  # the cube is then at least six radii wide: no sphere meets a neighbour twice
@@ -371,7 +372,7 @@ def cells_of(packing: Packing, edge: float | None = None) -> Cells:
     return Cells(side, m, far, centres, first.astype(np.int32), code[order].astype(np.int32))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**KERNEL)
 def _first_border(p, d, place, edge):
     """Return the distance to the first border of cells along an axis, and between borders; infinity if parallel."""
     if abs(d) < 1e-12:  # within the reach of a line it does not come out of its cells' padding
@@ -380,7 +381,7 @@ def _first_border(p, d, place, edge):
     return ((place + (1 if d > 0.0 else 0)) * edge - p) * per_d, edge * abs(per_d)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**KERNEL)
 def next_sphere(cells, origin, direction, t_min, t_max):
     """Return the first sphere that a ray enters beyond t_min: distance, tile (three integers) and number.
 

@@ -6,6 +6,7 @@ Figures are made without pyplot, so nothing global changes, and `save` writes th
 import io
 import math
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +111,68 @@ def plot_validation(table: Table) -> Any:
             _deviation(below, table)
         else:
             _fits(figure.subplots(), table)
+    return figure
+
+
+def plot_levels(rows: Sequence[Mapping[str, Any]], reference: str, title: str) -> Any:
+    """Return a matplotlib Figure of the model error of levels against the time they take to little noise.
+
+    Parameters
+    ----------
+    rows : sequence of dict
+        As of `compare.facts`: level, seconds_to_1_percent, and the relative errors rmse, rmse_low and rmse_high [1],
+        with rmse_seen 0 where rmse is a bound. The reference comes first; its rmse is its own noise.
+    reference : str
+        What the errors are to.
+    title : str
+    """
+    import matplotlib
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogFormatter
+
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(6.8, 4.4), layout="constrained")
+        axes = figure.subplots()
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        points = [row for row in rows if 0.0 < row["seconds_to_1_percent"] < math.inf and 0.0 < row["rmse"] < math.inf]
+        shown = [100.0 * row["rmse"] for row in points]
+        floor = 0.3 * min(shown, default=1.0)
+        words = []
+        for k, (row, error) in enumerate(zip(points, shown, strict=True)):
+            time = row["seconds_to_1_percent"]
+            style: Any = {"color": f"C{k}", "markersize": 6}
+            if row is rows[0]:
+                axes.axhline(error, color="C0", linestyle=":", linewidth=1.0)
+                axes.plot(time, error, "s", **style)
+                word = f"{row['level']} (its noise)"
+            elif row["rmse_seen"]:
+                low, high = 100.0 * row["rmse_low"], 100.0 * row["rmse_high"]
+                axes.errorbar(time, error, [[error - max(low, floor)], [high - error]], fmt="o", capsize=3, **style)
+                word = row["level"]
+            else:
+                axes.errorbar(time, error, 0.35 * error, fmt="_", uplims=True, **style)
+                word = f"{row['level']} (below)"
+            words.append(word)
+        if points:
+            times = [row["seconds_to_1_percent"] for row in points]
+            top = 2.0 * max(*shown, *(100.0 * row["rmse_high"] for row in points))
+            axes.set_xlim(min(times) / 1.6, max(times) * 1.6)
+            axes.set_ylim(floor, top)
+            height = -1.0
+            for k in np.argsort(shown):  # names stand beside the axes, pushed apart where points are close
+                height = max(math.log(shown[k] / floor) / math.log(top / floor), height + 0.055)
+                axes.annotate(
+                    _literal(words[k]), (times[k], shown[k]), (1.04, height), "data", "axes fraction", va="center",
+                    color=f"C{k}", arrowprops={"arrowstyle": "-", "color": f"C{k}", "linewidth": 0.4},
+                )  # fmt: skip
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(2, 0.5)))
+        axes.grid(which="both", linewidth=0.3, alpha=0.5)
+        axes.set_xlabel("time to a relative standard error of 1 % per pixel [s]")
+        axes.set_ylabel(f"error of the model: RMSE to {reference}, noise taken off [%]")
+        axes.set_title(_literal(title))
     return figure
 
 

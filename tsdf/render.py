@@ -23,9 +23,11 @@ from tsdf.world import World, camera_of
 
 SLOTS = 2048  # walkers under way at once, per thread, but for shadows: their state stays in the second-level cache
 ROOM = 4 * SLOTS
-BLOCK = 16384  # samples of a block, about
-PARTS = 16  # of the samples of a small picture, so that threads have something to share
-FEW = 16  # samples per pixel and block, at most, of large pictures
+BLOCK = 65536  # samples of a block, about: the last few walkers of each wait for the ray engine alone
+LEAST = 4096  # samples of a block, however few are asked for
+PARTS = 16  # of a pass, so that threads have something to share; and of the time, so that it is kept
+FEW = 16  # samples per pixel of a pass of a large picture; the first has one, so that soon no pixel is black
+GROWTH = 8  # of a pass over the one before it, at most, while it is not known how long they take
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +138,7 @@ def render(
     spp : int, optional
         Samples per pixel.
     seconds : float, optional
-        Stop after this time; pixels then differ by a few samples.
+        Stop when another pass over all pixels would take longer than this; one is always made.
     target_error : float, optional
         Stop when `Picture.relative_error` is below this.
     seed : int
@@ -177,10 +179,6 @@ def measure(
     stop = stop or threading.Event()
     halt = threading.Event()
     count = width * height
-    share = max(FEW, BLOCK // count) if seconds is None or count * FEW <= BLOCK else 4
-    if spp:
-        share = max(1, min(share, spp, max(spp // PARTS, BLOCK // (PARTS * count))))
-    step = max(1, BLOCK // share)
     total, squares = np.zeros((count, 3)), np.zeros((count, 3))
     samples = np.zeros(count, np.int64)
     pool = [Walkers(world) for _ in range(threads)]
@@ -210,49 +208,57 @@ def measure(
             interrupted,
         )  # fmt: skip
 
-    def share_done(done: float) -> float:
-        shares = [0.0]
-        if spp:
-            shares.append(done / spp)
-        if seconds:
-            shares.append((time.perf_counter() - begin) / seconds)
-        return min(1.0, max(shares))
+    def following(share: int, took: float) -> int:
+        """Return how many samples per pixel the next pass has, 0 for no next pass; the last one had `share`."""
+        most = max(FEW, PARTS * BLOCK // count)
+        if spp is not None:
+            return min(most if share else 1, spp - done)
+        if seconds is None:
+            return most if share else 1
+        if not share:
+            return 1
+        left = seconds - (time.perf_counter() - begin)
+        return int(min(share * min(left, seconds / PARTS) / max(took, 1e-6), most, GROWTH * share))
 
-    def over() -> bool:
-        return stop.is_set() or (seconds is not None and time.perf_counter() - begin >= seconds)
-
-    def blocks() -> Iterator[tuple[int, int, int, int]]:
-        """Pixels, their number, samples, the number of the first, one block of samples after the other."""
-        done = 0
-        while spp is None or done < spp:
-            number = min(share, spp - done) if spp else share
+    def blocks(share: int) -> Iterator[tuple[int, int, int, int]]:
+        """First pixel, pixels, samples of each and the number of the first, one block of a pass after the other."""
+        size = min(max(share * count // PARTS, LEAST), BLOCK)
+        number = min(share, size)
+        step = max(1, size // number)
+        for sample in range(done, done + share, number):
             for pixel in range(0, count, step):
-                yield pixel, min(step, count - pixel), number, done
-            done += number
+                yield pixel, min(step, count - pixel), min(number, done + share - sample), sample
 
-    coming = blocks()
+    done, share, took = 0, 0, 0.0
     waiting: deque[tuple[tuple[int, int, int, int], Future]] = deque()
     with ThreadPoolExecutor(threads) as executor:
         try:
-            while not over():
-                while len(waiting) < 2 * threads and (block := next(coming, None)):
-                    waiting.append((block, executor.submit(job, *block)))
-                if not waiting:
+            while not stop.is_set() and (share := following(share, took)) > 0:
+                coming, found, start = blocks(share), 0, time.perf_counter()
+                while not stop.is_set():
+                    while len(waiting) < 2 * threads and (block := next(coming, None)):
+                        waiting.append((block, executor.submit(job, *block)))
+                    if not waiting:
+                        break
+                    (pixel, pixels, number, _), future = waiting[0]
+                    try:
+                        radiance = future.result(timeout=0.1)
+                    except TimeoutError:
+                        continue
+                    waiting.popleft()
+                    total[pixel : pixel + pixels] += radiance.sum(axis=1)
+                    squares[pixel : pixel + pixels] += (radiance**2).sum(axis=1)
+                    samples[pixel : pixel + pixels] += number
+                    found += number * pixels
+                    if progress is not None:
+                        part = (done + found / count) / spp if spp else 0.0
+                        if seconds is not None:
+                            part = min(1.0, (time.perf_counter() - begin) / seconds)
+                        progress(part, f"{done + found // count} spp")
+                else:
                     break
-                (pixel, pixels, number, sample), future = waiting[0]
-                try:
-                    found = future.result(timeout=0.1)
-                except TimeoutError:
-                    continue
-                waiting.popleft()
-                total[pixel : pixel + pixels] += found.sum(axis=1)
-                squares[pixel : pixel + pixels] += (found**2).sum(axis=1)
-                samples[pixel : pixel + pixels] += number
-                if progress is not None:
-                    done = sample + number * (pixel + pixels) / count
-                    progress(share_done(done), f"{sample + number} spp")
-                whole = pixel + pixels == count and sample + number >= 2
-                if target_error is not None and whole and picture(False).relative_error <= target_error:
+                took, done = time.perf_counter() - start, done + share
+                if target_error is not None and done > 1 and picture(False).relative_error <= target_error:
                     break
         except KeyboardInterrupt:
             stop.set()

@@ -23,7 +23,7 @@ from tsdf.lights import draw as draw_light
 from tsdf.lights import radiance as light_from
 from tsdf.sampler import column_of, density, draw_column, draw_length, draw_offset, draw_record, leave, turned
 from tsdf.sampling import key_of, mix, unit
-from tsdf.vectors import cross, dot, frame, minus, step, triple
+from tsdf.vectors import KERNEL, cross, dot, frame, minus, step, triple
 
 TELEPORT, TELEPORT_JOINT, VOLUME, VOLUME_HG, ISOTROPIC, EXPLICIT = range(6)
 MODELS = {
@@ -108,7 +108,7 @@ class Camera(NamedTuple):
     width: int
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**KERNEL)
 def absorbed(absorption, amounts):
     """Return the colour that the amounts of matter crossed leave of white light."""
     if absorption.least.shape[0] == 0:
@@ -132,7 +132,7 @@ def absorbed(absorption, amounts):
     return r * math.exp(er), g * math.exp(eg), b * math.exp(eb)
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def find(w, r, g, b, amounts, absorption, radiance):
     """Add light found by a walker to its sample."""
     ar, ag, ab = absorbed(absorption, amounts)
@@ -141,7 +141,7 @@ def find(w, r, g, b, amounts, absorption, radiance):
     radiance[w.sample, 2] += w.weight * w.colour[2] * b * ab
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(forceinline=True, **KERNEL)
 def lobe(g, u):
     """Return the cosine drawn from a Henyey-Greenstein phase function."""
     if abs(g) < 1e-6:
@@ -150,14 +150,14 @@ def lobe(g, u):
     return min(max((1.0 + g * g - s * s) / (2.0 * g), -1.0), 1.0)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(forceinline=True, **KERNEL)
 def lobe_density(g, cosine):
     """Return the Henyey-Greenstein phase function per steradian."""
     s = 1.0 + g * g - 2.0 * g * cosine
     return (1.0 - g * g) / (4.0 * math.pi * s * math.sqrt(s))
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(forceinline=True, **KERNEL)
 def bent(d, cosine, u):
     """Return d deflected by an angle of given cosine at azimuth 2 pi u."""
     a, b = frame(d)
@@ -166,20 +166,20 @@ def bent(d, cosine, u):
     return step(step((cosine * d[0], cosine * d[1], cosine * d[2]), sine * c, a), sine * s, b)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(forceinline=True, **KERNEL)
 def renewed(d):
     """Return a nearly unit vector with unit length: keeps rounding errors from piling up."""
     half = 1.5 - 0.5 * dot(d, d)
     return d[0] * half, d[1] * half, d[2] * half
 
 
-@njit(cache=True, forceinline=True)
+@njit(forceinline=True, **KERNEL)
 def halves(bits):
     """Return two numbers in [0, 1) from 64 bits."""
     return float(bits >> np.uint64(32)) * HALF_WORD, float(bits & LOW) * HALF_WORD
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(forceinline=True, **KERNEL)
 def offset_of(media, tables, c, column, key):
     """Draw r, z, phi_Delta and the path length [R] given the deflection, from the word of `key` and the next."""
     bits = mix(key)
@@ -194,7 +194,7 @@ def offset_of(media, tables, c, column, key):
 # ------------------------------------------------------------------------------------- next-event estimation
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**KERNEL)
 def connect(w, amounts, m, p, d, c, key, share, safe, media, tables, lights, shadow, its_amounts):
     """Start in `shadow` light that arrives from a light and is deflected into the walker's path by a grain; return
     whether there is any.
@@ -221,7 +221,7 @@ def connect(w, amounts, m, p, d, c, key, share, safe, media, tables, lights, sha
     if not phase > 0.0:
         return False
     weight = phase / (light_pdf + phase) / share
-    its_amounts[:] = amounts
+    copy(its_amounts, amounts)
     amount, offset = 1.0, (0.0, 0.0, 0.0)
     key += GOLDEN
     if media.model <= TELEPORT_JOINT:
@@ -252,13 +252,20 @@ def connect(w, amounts, m, p, d, c, key, share, safe, media, tables, lights, sha
     return True
 
 
-@njit(cache=True)
+@njit(**KERNEL)
+def copy(row, other):
+    """Write a row to another."""
+    for i in range(row.shape[0]):
+        row[i] = other[i]
+
+
+@njit(**KERNEL)
 def write(row, v):
     """Write a triple to a row."""
     row[0], row[1], row[2] = v
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def cast(w, shadow, p, toward, light, weight, m, key):
     """Write the shadow of walker w: from p toward a light of that colour."""
     write(shadow.p, p)
@@ -271,7 +278,7 @@ def cast(w, shadow, p, toward, light, weight, m, key):
     shadow.tries, shadow.shadow = 0, 1
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def aim(w, offset, size, d_out, amount, c):
     """Begin a jump of given size along an offset of any length."""
     w.mode, w.length, w.gained, w.component = JUMP, size, amount, c
@@ -283,7 +290,7 @@ def aim(w, offset, size, d_out, amount, c):
 # ------------------------------------------------------------------------------------------ deep inside
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def lives(w, key):
     """Play roulette with a walker that has become dim: it ends, or goes on with what those that end had.
 
@@ -297,7 +304,7 @@ def lives(w, key):
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**KERNEL)
 def wander(w, amounts, once, out, out_amounts, live, most, g, media, tables, lights, absorption, counters):
     """Take a walker that is in a known medium from event to event while nothing else can be met.
 
@@ -420,7 +427,7 @@ def wander(w, amounts, once, out, out_amounts, live, most, g, media, tables, lig
 # ---------------------------------------------------------------------------------------- where things are
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**KERNEL)
 def surface_met(g, p, d, hits, ray):
     """Return distance to the next opaque surface, its number, its normal against d, its thickness, and whether the ray
     engine named a facet that is behind p."""
@@ -447,7 +454,7 @@ def surface_met(g, p, d, hits, ray):
     return best, which, n, slack, spurious
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**KERNEL)
 def boundary_met(g, m, p, d, hits, ray):
     """Return distance to the next boundary of medium m, whether the ray is inside until then, the outward normal, the
     boundary's thickness, and whether the ray engine named a facet that is behind p."""
@@ -462,7 +469,7 @@ def boundary_met(g, m, p, d, hits, ray):
     return t, cosine > 0.0, n, g.plane_slack[facet], t < 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**KERNEL)
 def beyond(slack, cosine):
     """Return how far along a ray a point is to be moved to be clear of a facet."""
     return slack * min(1.0 / abs(cosine), GRAZING)
@@ -473,7 +480,7 @@ def beyond(slack, cosine):
 GO_ON, LOOK_AGAIN, ENDED = 0, 1, 2
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**KERNEL)
 def bounce(w, amounts, p, d, t, n, slack, surface, out, out_amounts, live, g, lights):
     """Put a walker that comes from p along d on a diffuse surface at distance t and send it on; return walkers in `out`
     and what becomes of it."""
@@ -495,7 +502,7 @@ def bounce(w, amounts, p, d, t, n, slack, surface, out, out_amounts, live, g, li
         cosine = dot(n, toward)
         if light_pdf > 0.0 and cosine > 0.0:
             scattered = cosine / math.pi
-            out_amounts[live][:] = amounts
+            copy(out_amounts[live], amounts)
             cast(w, out[live], p, toward, light, scattered / (light_pdf + scattered), UNKNOWN, mix(w.key ^ OTHER))
             live += 1
     cosine = math.sqrt(1.0 - u0)
@@ -511,7 +518,7 @@ def bounce(w, amounts, p, d, t, n, slack, surface, out, out_amounts, live, g, li
     return live, GO_ON
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**KERNEL)
 def again(w, slack, counters):
     """Move the start of a walker's next ray beyond a facet that the ray engine sees and that is behind it."""
     w.skip = max(2.0 * w.skip, slack)
@@ -522,7 +529,7 @@ def again(w, slack, counters):
     return LOOK_AGAIN
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**KERNEL)
 def land(w, amounts, hits, out, out_amounts, live, g, media, lights, counters):
     """End a walker's jump; return walkers in `out` and what becomes of it."""
     p, e, m = triple(w.p), triple(w.e), w.medium
@@ -541,12 +548,22 @@ def land(w, amounts, hits, out, out_amounts, live, g, media, lights, counters):
         if media.slot[w.component] >= 0:
             amounts[media.slot[w.component]] -= w.gained * max(0.0, 1.0 - t / w.length)
         return bounce(w, amounts, p, e, t, n, slack, surface, out, out_amounts, live, g, lights)
+    move = beyond(slack_b, dot(n_b, e))
+    if leaves:
+        for k in range(g.kind.shape[0]):
+            t_k, inside, n_k, slack_k, spurious = boundary_met(g, k, p, e, hits, w.ray)
+            if k != m and not inside and not spurious and abs(t_k - t_b) * abs(dot(n_k, e)) <= slack_b + slack_k:
+                # Another medium begins where this one ends: the grain lies in both
+                gone = min(t_b + move, w.length)
+                write(w.p, step(p, gone, e))
+                w.gained *= 1.0 - gone / w.length
+                w.medium, w.length = k, w.length - gone
+                return live, GO_ON
     write(w.d, triple(w.q))
     w.mode, w.free = FLY, -1.0
     if leaves:
         if media.slot[w.component] >= 0:
             amounts[media.slot[w.component]] -= w.gained * (1.0 - t_b / w.length)
-        move = beyond(slack_b, dot(n_b, e))
         if dot(triple(w.q), n_b) < 0.0:
             move = -min(move, 0.5 * t_b)
         write(w.p, step(p, t_b + move, e))
@@ -556,7 +573,7 @@ def land(w, amounts, hits, out, out_amounts, live, g, media, lights, counters):
     return live, GO_ON
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**KERNEL)
 def fly(w, amounts, hits, out, out_amounts, live, g, media, tables, lights, grains, absorption, radiance, counters):
     """Take a walker along its straight flight to what comes first; return walkers in `out` and what becomes of it."""
     p, d = triple(w.p), triple(w.d)
@@ -626,7 +643,7 @@ def fly(w, amounts, hits, out, out_amounts, live, g, media, tables, lights, grai
     return live, ENDED
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**KERNEL)
 def enter(w, grains, media, m, s, centre, key):
     """Bring a walker to a grain's bounding sphere at distance s and into the grain's frame."""
     radius = grains.radius[m]
@@ -643,7 +660,7 @@ def enter(w, grains, media, m, s, centre, key):
     w.ray = NONE
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**KERNEL)
 def in_grain(w, amounts, facet, grains, media, absorption, counters):
     """Take a walker through the next hit in its grain; return what becomes of it."""
     c, radius = w.component, grains.radius[w.medium]
@@ -687,7 +704,7 @@ def in_grain(w, amounts, facet, grains, media, absorption, counters):
     return GO_ON
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**KERNEL)
 def advance(count, walkers, amounts, out, out_amounts, hits, grain_hits, starts, ways, grain_starts, grain_ways,
             g, media, tables, lights, grains, absorption, radiance, counters, asked):  # fmt: skip
     """Take each walker as far as it comes without the ray engine.
@@ -697,7 +714,8 @@ def advance(count, walkers, amounts, out, out_amounts, hits, grain_hits, starts,
     and of rays by exemplar.
     """
     live, rays = 0, 0
-    asked[:] = 0
+    for i in range(asked.shape[0]):
+        asked[i] = 0
     explicit = media.model == EXPLICIT
     for i in range(count):
         w, a = walkers[i], amounts[i]
@@ -759,7 +777,7 @@ def advance(count, walkers, amounts, out, out_amounts, hits, grain_hits, starts,
                 break
         if w.sample >= 0:
             out[live] = w
-            out_amounts[live] = a
+            copy(out_amounts[live], a)
             live += 1
     # Shadows that were born on the way have not looked yet
     if g.engines > 0:
@@ -775,7 +793,7 @@ def advance(count, walkers, amounts, out, out_amounts, hits, grain_hits, starts,
     asked[LIVE], asked[ASKED] = live, rays
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**KERNEL)
 def spawn(first, count, pixels, spp, sample, seed, camera, walkers, amounts):
     """Start walkers for the samples first .. first + count - 1 of a job: sample i is of pixel pixels[0] + i // spp."""
     for i in range(count):
@@ -794,4 +812,5 @@ def spawn(first, count, pixels, spp, sample, seed, camera, walkers, amounts):
         w.weight, w.luck, w.pdf, w.free, w.skip = 1.0, 0.0, -1.0, -1.0, 0.0
         w.key, w.events, w.sample, w.ray, w.medium, w.mode = key + GOLDEN, 0, local, NONE, UNKNOWN, FLY
         w.tries, w.shadow = 0, 0
-        amounts[i, :] = 0.0
+        for k in range(amounts.shape[1]):
+            amounts[i, k] = 0.0

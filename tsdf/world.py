@@ -189,7 +189,7 @@ def _extent(medium: MediumSpec, vertices: np.ndarray | None) -> float:
 
 def _no_table() -> Table:
     """Return a table for scenes without media, whose kernels want one."""
-    return exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=8))
+    return exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=8, joint=1))
 
 
 def _lights(scene: Scene) -> LightArrays:

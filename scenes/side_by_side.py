@@ -1,0 +1,87 @@
+"""Pictures of one scene at the levels explicit, teleport and volume, and how far the last two are from the first.
+
+    python scenes/side_by_side.py EXPLICIT.exr TELEPORT.exr VOLUME.exr OUT.png [EXPOSURE]
+
+Prints, and writes under each error image, the difference of the pictures' means and the mean of |difference|, both over
+the mean of the explicit picture, and what of the latter is expected from noise alone.
+"""
+
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from tsdf import image
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, ITU-R BT.709
+NAMES = ("explicit", "teleport", "volume")
+
+
+class Difference(NamedTuple):
+    """How far a picture is from another, each over the mean luminance of that other [1]."""
+
+    bias: float  # of the means, signed
+    error: float  # mean of |difference| over the pixels
+    noise: float  # what `error` would be if the two differed by their noise only
+    per_pixel: np.ndarray  # (h, w) |difference|
+
+
+def difference(one: image.Image, truth: image.Image) -> Difference:
+    """Return how far the luminance of a picture is from that of the truth."""
+    a, b = one.rgb.astype(np.float64) @ LUMINANCE, truth.rgb.astype(np.float64) @ LUMINANCE
+    if a.shape != b.shape:
+        raise SystemExit(f"the pictures are of {a.shape[1]} x {a.shape[0]} and {b.shape[1]} x {b.shape[0]} pixels")
+    deviation = np.zeros_like(b)
+    if one.variance is not None and truth.variance is not None:
+        # Channels of a sample are nearly the same random number: their deviations add, not their variances
+        deviation = np.hypot(*(np.sqrt(picture.variance.astype(np.float64)) @ LUMINANCE for picture in (one, truth)))
+    mean = b.mean()
+    return Difference(
+        float((a.mean() - mean) / mean),
+        float(np.abs(a - b).mean() / mean),
+        float(math.sqrt(2.0 / math.pi) * deviation.mean() / mean),
+        np.abs(a - b) / mean,
+    )
+
+
+def side_by_side(pictures: Sequence[Path], out: Path, exposure: float = 0.0) -> tuple[Difference, Difference]:
+    """Write the plate of three pictures (explicit, teleport, volume) as PNG and return the differences of the last two
+    to the first."""
+    import colour
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    truth, *others = shown = [image.read_exr(path) for path in pictures]
+    found = [difference(one, truth) for one in others]
+    height, width = truth.rgb.shape[:2]
+    figure = Figure(figsize=(15.0, 10.0 * height / width + 1.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    top, bottom = figure.subplots(2, 3)
+    for axes, name, one in zip(top, NAMES, shown, strict=True):
+        axes.imshow(colour.cctf_encoding(np.clip(one.rgb.astype(np.float64) * 2.0**exposure, 0.0, 1.0)))
+        axes.set_title(name)
+    most = float(np.quantile([one.per_pixel for one in found], 0.99))
+    for axes, name, one in zip(bottom[1:], NAMES[1:], found, strict=True):
+        plate = axes.imshow(one.per_pixel, vmin=0.0, vmax=most, cmap="magma")
+        axes.set_title(
+            f"|{name} - explicit|: mean {one.error:.1%} (noise {one.noise:.1%}), of the means {one.bias:+.1%}"
+        )
+    for axes in (*top, *bottom):
+        axes.set_axis_off()
+    figure.colorbar(plate, ax=bottom[0], location="right", label="|difference| / mean of explicit, luminance")
+    figure.savefig(out, dpi=100, metadata={"Software": None})
+    return found[0], found[1]
+
+
+if __name__ == "__main__":
+    if len(sys.argv) not in (5, 6):
+        raise SystemExit((__doc__ or "").split("\n\n")[1].strip())
+    results = side_by_side([Path(p) for p in sys.argv[1:4]], Path(sys.argv[4]), *map(float, sys.argv[5:]))
+    for level, result in zip(NAMES[1:], results, strict=True):
+        print(
+            f"{level}: mean {result.bias:+.2%} of explicit, mean |difference| {result.error:.2%} "
+            f"(noise {result.noise:.2%})"
+        )

@@ -1,0 +1,100 @@
+"""The shipped scenes: their assets are sound and the same every time, and each renders at the levels it is for."""
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scenes import make_assets
+from scenes.side_by_side import difference, side_by_side
+from tsdf import image, render, scene, world
+from tsdf.grains import load_grain, read_mesh
+from tsdf.optics import Optics
+from tsdf.scatterometer import Effort, exact_sphere
+
+FOLDER = Path(make_assets.__file__).parent
+LEVELS = {
+    "snow": ("teleport", "volume"),
+    "sand": ("teleport", "volume"),
+    "beads": ("explicit", "teleport", "volume"),
+}
+
+
+@pytest.fixture(scope="module")
+def assets(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scenes")
+    make_assets.make(folder / "assets")
+    return folder
+
+
+def loaded(name, folder, width):
+    """The shipped scene, small, with the table of a sphere for each of its grains: tables are made by `make demo`."""
+    data = tomllib.loads((FOLDER / f"{name}.toml").read_text())
+    stand_in = folder / "any.tsdf.exr"
+    stand_in.write_bytes(b"")
+    for medium in data["medium"]:
+        for grain in medium["grain"]:
+            grain["table"] = stand_in.name
+    made = scene.parse(data, folder, name)
+    table = exact_sphere(load_grain("sphere"), Optics(1.5), Effort(cells=256, joint=32))
+    media = tuple(
+        replace(medium, grains=tuple(replace(grain, table=table) for grain in medium.grains)) for medium in made.media
+    )
+    return replace(made, media=media, camera=replace(made.camera, width=width, height=max(1, width * 9 // 16)))
+
+
+@pytest.mark.parametrize(("name", "level"), [(name, level) for name in LEVELS for level in LEVELS[name]])
+def test_every_scene_renders(assets, name, level):
+    """A few pixels of each scene at each of its levels are finite, lit, and no path is lost."""
+    made = world.build(loaded(name, assets, 8), level)
+    picture = render.render(made, spp=2)
+    assert np.isfinite(picture.rgb).all() and picture.rgb.min() >= 0.0
+    assert picture.rgb.mean() > 0.01
+    assert picture.events > 0
+    assert picture.truncated + picture.faults == 0
+
+
+def test_the_meshes_are_closed_and_wound_outward(assets):
+    """Each edge is shared by two faces that run along it in opposite ways, and the volume is positive."""
+    for name in make_assets.MESHES:
+        vertices, faces = read_mesh(assets / "assets" / f"{name}.ply")
+        edges = np.concatenate((faces[:, :2], faces[:, 1:], faces[:, [2, 0]]))
+        there = {tuple(edge) for edge in edges.tolist()}
+        assert len(there) == len(edges), name
+        assert all((b, a) in there for a, b in there), name
+        a, b, c = vertices[faces].swapaxes(0, 1)
+        assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() > 0.0, name
+        assert vertices[:, 2].min() == 0.0, name
+
+
+def test_assets_are_the_same_every_time(assets, tmp_path):
+    """Two makings give the same bytes."""
+    for path in make_assets.make(tmp_path):
+        assert path.read_bytes() == (assets / "assets" / path.name).read_bytes(), path.name
+
+
+def test_difference_tells_noise_from_error(tmp_path):
+    """Pictures that differ by their noise show as such, and a bias of 10 % shows as 10 %: the negative control."""
+    rng = np.random.default_rng(0)
+    noise = 0.05
+    variance = np.full((60, 80, 3), noise**2, np.float32)
+
+    def picture(mean):
+        grey = rng.normal(mean, noise, (60, 80, 1)) * np.ones(3)
+        return image.Image(grey.astype(np.float32), variance)
+
+    standard_error = noise * np.sqrt(2.0 / (60 * 80))
+    truth = picture(1.0)
+    same = difference(picture(1.0), truth)
+    assert abs(same.bias) < 4.0 * standard_error
+    assert abs(same.error - same.noise) < 4.0 * standard_error
+    other = difference(picture(1.1), truth)
+    assert abs(other.bias - 0.1) < 4.0 * standard_error
+    assert other.error - other.noise > 4.0 * standard_error
+    paths = [tmp_path / f"{k}.exr" for k in range(3)]
+    for path in paths:
+        image.write_exr(path, truth.rgb, truth.variance)
+    side_by_side(paths, tmp_path / "plate.png")
+    assert (tmp_path / "plate.png").stat().st_size > 1000
