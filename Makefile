@@ -52,5 +52,7 @@ check: .venv/installed  ## style and types
 
 bench: .venv/installed  ## measure speed and error side by side, into bench/
 	$(BIN)/python benchmarks/bench.py
+	$(BIN)/python benchmarks/bench_sampler.py
+	$(BIN)/python benchmarks/bench_render.py
 
 .PHONY: help install demo gallery pictures test check bench

@@ -107,7 +107,7 @@ def test_library_does_not_import_the_command_line() -> None:
         assert not any(name.startswith(("click", "tsdf.cli")) for name, _ in imports(path)), path
 
 
-@pytest.mark.parametrize("command", ["build", "compare", "info", "merge", "plot", "render", "validate"])
+@pytest.mark.parametrize("command", ["build", "compare", "export", "info", "merge", "plot", "render", "validate"])
 def test_help_loads_nothing_slow(command: str) -> None:
     """``--help`` is instant because no array library is loaded for it."""
     code = (

@@ -1,12 +1,13 @@
 """Vectors as triples of floats, which the compiler keeps in registers where arrays would cost a reference count."""
 
 import math
+from typing import Any
 
 from numba import njit
 
 # Options of kernels that allocate nothing: without counting references, which takes two thirds of the time of a kernel
 # that is handed many arrays. Not a public option of numba's: without it, all works, only slower.
-KERNEL = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
+KERNEL: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
 
 
 @njit(cache=True)
