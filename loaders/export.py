@@ -1,0 +1,596 @@
+"""Parameters for renderers that know homogeneous media but no tables, and tables as plain arrays.
+
+All renderers here get the level volume-hg: point scatterers with Henyey-Greenstein lobes. What that costs stands in
+each text, as `notes` says it. Coefficients are in 1/scene unit and of linear sRGB; the medium's boundary is
+index-matched, for a heap of grains has no surface of its own. The numbers themselves are from `tsdf.medium`.
+
+[1] Kulla & Conty 2017, Revisiting physically based shading at Imageworks (SIGGRAPH course), albedo inversion
+[2] OpenPBR 1.1, section on the translucent base; MaterialX 1.39, physically based shading nodes
+"""
+
+import csv
+import io
+import json
+import math
+import os
+import re
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from tsdf import image
+from tsdf.errors import UsageError
+from tsdf.files import replacing
+from tsdf.lights import LUMINANCE
+from tsdf.medium import Component, VolumeParameters, volume_parameters
+from tsdf.scene import Absorption, absorption_at
+from tsdf.table import CONDITIONALS, Table, thawed
+
+ENOUGH = 0.02  # [1] total variation up to which one lobe is taken where a target could mix two
+BETTER = 0.9  # [1] of the error of one lobe, which two must stay below
+MOST_BOUNCES = 1024  # Cycles' own limit
+DEEP = 4000.0  # [transport mean free paths] from which on a body counts as deep
+MODES = 20_000  # of the diffusion equation in a slab
+EXTRAPOLATED = 0.7104  # [transport mean free paths] beyond a boundary diffuse light vanishes (Milne)
+LARGEST_G = 0.9999  # [1] as fits have it
+NOTHING = Absorption("grey", (0.0,))
+SLAB = 40.0  # [R] thickness at which levels are measured
+LEVELS = ("volume-hg", "volume", "teleport")
+
+
+@dataclass(frozen=True, eq=False)
+class Bulk:
+    """Grains in bulk as a homogeneous medium, by colour.
+
+    Attributes
+    ----------
+    table : Table
+    packing_fraction : float
+        Share of the volume in bounding spheres [1], in (0, 0.74].
+    radius : float
+        Bounding radius of the grains [scene unit].
+    absorption : (3,) float
+        Absorption coefficient of the grains' material, red, green, blue [1/scene unit].
+
+    Raises
+    ------
+    UsageError
+        For numbers out of range.
+    """
+
+    table: Table
+    packing_fraction: float
+    radius: float
+    absorption: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        for a in self.absorption:
+            self.at(a)
+
+    def at(self, absorption: float) -> VolumeParameters:
+        """Return the medium where the grains' material absorbs with a coefficient [1/scene unit].
+
+        As the renderer does, the albedo is over that of the lossless grain: what the tracer of the table gave up is no
+        absorption, and a millionth of it would darken a deep layer by half a percent.
+        """
+        grain = Component(self.table, radius=self.radius)
+        found = volume_parameters([grain], self.packing_fraction, [absorption])
+        return replace(found, albedo=min(1.0, found.albedo / self.table.albedo()))
+
+    @cached_property
+    def channels(self) -> tuple[VolumeParameters, ...]:
+        """The medium in red, green and blue."""
+        return tuple(self.at(a) for a in self.absorption)
+
+    @property
+    def sigma_t(self) -> np.ndarray:
+        """Extinction, (3,) float64 [1/scene unit]."""
+        return np.array([c.sigma_t for c in self.channels])
+
+    @property
+    def sigma_s(self) -> np.ndarray:
+        """Scattering, (3,) float64 [1/scene unit]."""
+        return np.array([c.sigma_s for c in self.channels])
+
+    @property
+    def sigma_a(self) -> np.ndarray:
+        """Absorption of the medium, (3,) float64 [1/scene unit]."""
+        return np.array([c.sigma_a for c in self.channels])
+
+    @property
+    def g(self) -> float:
+        """Mean cosine at the luminance of the absorption, as the renderer's level volume-hg takes it; 0 if black."""
+        g = self.at(float(np.dot(LUMINANCE, self.absorption))).g
+        return 0.0 if math.isnan(g) else max(-LARGEST_G, min(LARGEST_G, g))
+
+    def lobes(self, most: int | None = None) -> tuple[tuple[float, float], ...]:
+        """Return share and g of the Henyey-Greenstein lobes to mix, the table's own fit if they are two.
+
+        Two where one is farther than `ENOUGH` from the table and two are nearer, unless `most` says how many. The fit
+        of two is of the lossless grain.
+        """
+        fits = self.table.header["fits"]
+        one, two = fits["henyey_greenstein"], fits["two_lobe"]
+        if most is None:
+            error = one["total_variation"]
+            most = 2 if error > ENOUGH and two["total_variation"] < BETTER * error else 1
+        if most == 1:
+            return ((1.0, self.g),)
+        w = two["weight"]
+        return tuple((s, max(-LARGEST_G, min(LARGEST_G, two[n]))) for s, n in ((w, "g1"), (1.0 - w, "g2")))
+
+    def colour(self) -> np.ndarray:
+        """Return the reflectance of a deep layer under diffuse light, (3,) float64 [1], after [1]."""
+        return np.array([_deep_colour(c) for c in self.channels])
+
+
+def bulk(
+    table: Table,
+    packing_fraction: float,
+    radius: float,
+    absorption: Absorption = NOTHING,
+    metres_per_unit: float | None = None,
+) -> Bulk:
+    """Return the medium that stands for packed grains.
+
+    A spectrum becomes three coefficients so that a deep layer has the colour it has by wavelength; taking the mean of
+    the spectrum instead would let the wavelengths that are soaked up at once decide.
+
+    Parameters
+    ----------
+    table : Table
+    packing_fraction, radius
+        As of `Bulk`.
+    absorption : Absorption
+        Of the grains' material [1/scene unit]; none by default.
+    metres_per_unit : float, optional
+        Length of the scene unit [m]; only a material needs it.
+
+    Raises
+    ------
+    UsageError
+        For numbers out of range, and for a material without metres_per_unit.
+    """
+    if metres_per_unit is not None and not 0.0 < metres_per_unit < math.inf:
+        raise UsageError(f"the scene unit must be a finite number of metres > 0, not {metres_per_unit:g}")
+    lossless = Bulk(table, packing_fraction, radius, (0.0, 0.0, 0.0))
+    if absorption.kind == "spectral":
+        nm, weight = image.spectral_weights()
+        coefficient = absorption_at(absorption, nm, metres_per_unit)
+        seen = weight.T @ np.array([_deep_colour(lossless.at(a)) for a in coefficient])
+        of = [_absorption_of_colour(lossless, float(c), float(coefficient.max())) for c in seen]
+    else:
+        of = list(absorption.coefficient) * (3 if absorption.kind == "grey" else 1)
+    red, green, blue = of
+    return Bulk(table, packing_fraction, radius, (red, green, blue))
+
+
+def _deep_colour(medium: VolumeParameters) -> float:
+    """Return the reflectance of a deep layer: the albedo inversion of [1] solved for the reflectance."""
+    if not medium.albedo > 0.0:
+        return 0.0
+    s = math.sqrt(max(0.0, 1.0 - medium.albedo) / (1.0 - medium.albedo * medium.g))
+    # s = a + b A - sqrt(c + d A + b^2 A^2); squared, what is left is linear in A
+    a, b, c, d = 4.09712, 4.20863, 9.59217, 41.6808
+    return min(1.0, max(0.0, (c - (a - s) ** 2) / (2.0 * b * (a - s) - d)))
+
+
+def _absorption_of_colour(lossless: Bulk, colour: float, high: float) -> float:
+    """Return the absorption, from 0 to `high`, at which a deep layer has a reflectance."""
+    from scipy.optimize import brentq
+
+    def excess(a: float) -> float:
+        return _deep_colour(lossless.at(a)) - colour
+
+    if excess(0.0) <= 0.0:
+        return 0.0
+    return high if excess(high) >= 0.0 else float(brentq(excess, 0.0, high, xtol=1e-12 * high, rtol=1e-12))
+
+
+# ------------------------------------------------------------------------------------------- what it costs
+
+
+def lost(medium: Bulk, bounces: int, thickness: float = math.inf) -> float:
+    """Return about what share of the light that leaves a slab is lost if paths end after so many scatterings [1].
+
+    Light falls straight on one side of a slab; diffusion of the lossless walk, from one transport mean free path below
+    the surface, with the albedo of the channel that absorbs least to the power of the scatterings. Within a tenth of
+    the truth in slabs of five transport mean free paths and more if the share is below a tenth; too high in thinner
+    ones, up to three times in one of a third of that path.
+
+    Parameters
+    ----------
+    bounces : int
+        Number of scatterings that are followed, >= 0.
+    thickness : float
+        Of the slab [scene unit]; deep by default.
+    """
+    best = max(medium.channels, key=lambda c: c.albedo)
+    if not best.albedo > 0.0:
+        return 0.0
+    transport = 1.0 / (1.0 - medium.g)  # [mean free paths]
+    depth = min(thickness * best.sigma_t, DEEP * transport)
+    start = min(transport, 0.5 * depth) + EXTRAPOLATED * transport
+    wide = depth + 2.0 * EXTRAPOLATED * transport
+    k = np.pi * (2.0 * np.arange(MODES) + 1.0) / wide
+    leaving = transport / 3.0 * k**2
+    ending = leaving - math.log(min(best.albedo, 1.0))
+    share = np.sin(k * start) / k * leaving / ending
+    with np.errstate(under="ignore"):
+        return float(min(1.0, max(0.0, share @ np.exp(-ending * bounces) / share.sum())))
+
+
+def bounces(medium: Bulk, kept: float = 0.99, thickness: float = math.inf) -> int:
+    """Return the number of scatterings to follow so that a share of the light that leaves a slab is kept, >= 1."""
+    low, high = 0, 1
+    while lost(medium, high, thickness) > 1.0 - kept:
+        low, high = high, 2 * high
+    while high - low > max(1, high // 1000):
+        middle = (low + high) // 2
+        low, high = (middle, high) if lost(medium, middle, thickness) > 1.0 - kept else (low, middle)
+    return high
+
+
+def measure(medium: Bulk, thickness: float, samples: int = 20_000, seed: int = 0) -> dict[str, tuple[float, float]]:
+    """Return the reflectance of a slab under a perpendicular beam by level, and its standard error, by rendering it.
+
+    The slab lies in the scene as `thickness` [scene unit] says; luminance of the colour counts.
+    """
+    from tsdf import render, scene, world
+
+    camera = scene.Camera((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 1, 1, up=(0.0, 1.0, 0.0))
+    grains = (scene.GrainSpec(medium.table, absorption=Absorption("rgb", medium.absorption)),)
+    body = scene.MediumSpec(scene.Slab(-thickness, 0.0), medium.packing_fraction, medium.radius, grains, name="slab")
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        sky = Path(folder) / "sky.exr"
+        image.write_exr(sky, np.array([[[1.0] * 3], [[0.0] * 3]]))
+        made = scene.Scene(camera, (scene.EnvironmentLight(sky),), (body,), name="slab")
+        for level in LEVELS:
+            built = world.build(made, level)
+            beam = world.beam(built, (0.0, 0.0, medium.radius), (0.0, 0.0, -1.0))
+            picture = render.measure(built, beam, spp=samples, seed=seed)
+            error = np.sqrt(picture.variance[0, 0])
+            found[level] = float(np.dot(LUMINANCE, picture.rgb[0, 0])), float(np.dot(LUMINANCE, error))
+    return found
+
+
+def notes(medium: Bulk, lobes: int, measured: dict[str, tuple[float, float]] | None = None) -> list[str]:
+    """Return what a reader of the parameters has to know, one line each: level, errors, unit."""
+    header = medium.table.header
+    fits = header["fits"]
+    one, two = fits["henyey_greenstein"]["total_variation"], fits["two_lobe"]["total_variation"]
+    own = one if lobes == 1 else two
+    said = [
+        f"{header['grain']['name']}, eta {header['optics']['eta']:g}, packing fraction {medium.packing_fraction:g}, "
+        f"bounding radius {medium.radius:g} scene units; by tsdf-export",
+        "level volume-hg: point scatterers, " + ("one Henyey-Greenstein lobe" if lobes == 1 else "two lobes"),
+        f"error of the phase function: total variation {own:.2g} to the table"
+        + (f" (two lobes would leave {two:.2g})" if lobes == 1 and two < one else ""),
+    ]
+    if measured is None:
+        said.append("error of point scatterers: not measured (option --measure); docs/export.md lists some")
+    else:
+        (hg, hg_error), (teleport, teleport_error) = measured["volume-hg"], measured["teleport"]
+        values = ", ".join(f"{level} {r:.4f} +- {e:.1g}" for level, (r, e) in measured.items())
+        said.append(f"reflectance of a slab of {SLAB:g} R by level: {values}")
+        said.append(
+            f"error of point scatterers: reflects {hg - teleport:+.4f} +- {math.hypot(hg_error, teleport_error):.1g} "
+            "against level teleport there"
+        )
+    return said
+
+
+# ------------------------------------------------------------------------------------------------ targets
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """All that a target's text is made of."""
+
+    medium: Bulk
+    lobes: int | None = None  # Henyey-Greenstein lobes, where the target can mix; None: as many as are needed
+    kept: float = 0.99  # share of the light to keep [1]
+    thickness: float = math.inf  # of the body [scene unit]
+    measured: dict[str, tuple[float, float]] | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the grain as an identifier."""
+        word = re.sub(r"[^0-9A-Za-z]+", "_", self.medium.table.header["grain"]["name"]).strip("_")
+        return word if word[:1].isalpha() else f"grain_{word}".rstrip("_")
+
+    def notes(self, lobes: int = 1) -> list[str]:
+        return notes(self.medium, lobes, self.measured)
+
+    @cached_property
+    def bounces(self) -> int:
+        """Number of scatterings to follow."""
+        return bounces(self.medium, self.kept, self.thickness)
+
+    def depth(self) -> list[str]:
+        """Return what is to be said of the number of bounces."""
+        n = self.bounces
+        body = "a deep body" if math.isinf(self.thickness) else f"a slab {self.thickness:g} thick"
+        said = [f"bounces to keep {100.0 * self.kept:g} % of the light that leaves {body}: about {n}"]
+        if n > MOST_BOUNCES:
+            share = lost(self.medium, MOST_BOUNCES, self.thickness)
+            said.append(f"{MOST_BOUNCES} bounces lose about {100.0 * share:.2g} % of it")
+        return said
+
+
+def _number(value: float) -> str:
+    return f"{value:.9g}"
+
+
+def _triple(values: Sequence[float] | np.ndarray, separator: str = " ") -> str:
+    return separator.join(_number(float(v)) for v in values)
+
+
+def pbrt(request: Request) -> str:
+    """Return a pbrt-v4 medium, which has one lobe."""
+    m = request.medium
+    n = request.bounces
+    lines = [f"# {note}" for note in request.notes() + request.depth()]
+    lines += [
+        f'# Integrator "volpath" "integer maxdepth" [ {n} ]   # the default is 5, which is dark',
+        f'MakeNamedMedium "{request.name}" "string type" "homogeneous"',
+        f'  "rgb sigma_a" [ {_triple(m.sigma_a)} ]',
+        f'  "rgb sigma_s" [ {_triple(m.sigma_s)} ]',
+        f'  "float g" [ {_number(m.g)} ]',
+        f'# MediumInterface "{request.name}" ""',
+        '# Material "interface"',
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def blender(request: Request) -> str:
+    """Return Python for Blender that makes a material of Volume Scatter and Volume Absorption nodes.
+
+    One lobe unless two are asked for: Cycles can mix two, but under lights that it also samples, skies and areas, the
+    mix came out too bright (4.5; docs/blender.md).
+    """
+    m = request.medium
+    lobes = m.lobes(request.lobes or 1)
+    n = min(request.bounces, MOST_BOUNCES)
+    most_s, most_a = float(m.sigma_s.max()), float(m.sigma_a.max())
+    # Absorption is density times one minus the colour
+    nodes = [("ShaderNodeVolumeScatter", share * most_s, m.sigma_s / most_s, g) for share, g in lobes if most_s > 0.0]
+    rows = [f'    ("{kind}", {_number(d)}, ({_triple(c, ", ")}), {_number(g)}),' for kind, d, c, g in nodes]
+    if most_a > 0.0:
+        colour = _triple(1.0 - m.sigma_a / most_a, ", ")
+        rows.append(f'    ("ShaderNodeVolumeAbsorption", {_number(most_a)}, ({colour}), None),')
+    remarks = request.notes(len(lobes)) + request.depth()
+    if len(lobes) == 2:
+        remarks.append("two lobes come out too bright in Cycles 4.5 under sampled skies and areas, see docs/blender.md")
+    said = "\n".join(f"# {note}" for note in remarks)
+    return (
+        f"{said}\n"
+        "# Density is per unit of the object: apply the object's scale. Give the object no surface shader.\n"
+        "import bpy\n\n"
+        "VOLUMES = [  # node, density, colour, anisotropy\n" + "\n".join(rows) + "\n]\n"
+        f"BOUNCES = {n}\n\n"
+        f'material = bpy.data.materials.new("{request.name}")\n'
+        "material.use_nodes = True\n"
+        "nodes, links = material.node_tree.nodes, material.node_tree.links\n"
+        "nodes.clear()\n"
+        'output = nodes.new("ShaderNodeOutputMaterial")\n'
+        "volume = None\n"
+        "for kind, density, colour, anisotropy in VOLUMES:\n"
+        "    node = nodes.new(kind)\n"
+        '    node.inputs["Color"].default_value = (*colour, 1.0)\n'
+        '    node.inputs["Density"].default_value = density\n'
+        "    if anisotropy is not None:\n"
+        '        node.inputs["Anisotropy"].default_value = anisotropy\n'
+        "    if volume is None:\n"
+        "        volume = node.outputs[0]\n"
+        "    else:\n"
+        '        both = nodes.new("ShaderNodeAddShader")\n'
+        "        links.new(volume, both.inputs[0])\n"
+        "        links.new(node.outputs[0], both.inputs[1])\n"
+        "        volume = both.outputs[0]\n"
+        'links.new(volume, output.inputs["Volume"])\n'
+        "cycles = bpy.context.scene.cycles\n"
+        "cycles.volume_bounces = max(cycles.volume_bounces, BOUNCES)\n"
+        "cycles.max_bounces = max(cycles.max_bounces, BOUNCES)\n"
+    )
+
+
+def _document(said: Sequence[str], body: Sequence[str]) -> str:
+    """Return a MaterialX document; a comment may not hold two hyphens."""
+    comments = [f"  <!-- {note.replace('--', '- -')} -->" for note in said]
+    head = ['<?xml version="1.0"?>', '<materialx version="1.39" colorspace="lin_rec709">']
+    return "\n".join([*head, *comments, *body, "</materialx>"]) + "\n"
+
+
+def _node(kind: str, name: str, of: str, *inputs: tuple[str, str, str]) -> list[str]:
+    """Return a node with inputs of name, type and value; a value that begins with @ is the name of a node."""
+    rows = [
+        f"    <input name={quoteattr(n)} type={quoteattr(t)} "
+        + (f"nodename={quoteattr(v[1:])} />" if v.startswith("@") else f"value={quoteattr(v)} />")
+        for n, t, v in inputs
+    ]
+    return [f"  <{kind} name={quoteattr(name)} type={quoteattr(of)}>", *rows, f"  </{kind}>"]
+
+
+def openpbr(request: Request) -> str:
+    """Return a MaterialX document of two OpenPBR surfaces [2]: the medium itself, and a surface of its colour.
+
+    transmission_color is what is left of a beam after transmission_depth, so that extinction is -ln(colour) / depth,
+    and transmission_scatter / depth is scattering.
+    """
+    m, name = request.medium, request.name
+    depth = 1.0 / float(m.sigma_t.max())
+    shared = (("base_weight", "float", "0"), ("specular_weight", "float", "0"))
+    body = _node(
+        "open_pbr_surface", f"{name}_volume", "surfaceshader",
+        *shared,
+        ("transmission_weight", "float", "1"),
+        ("transmission_color", "color3", _triple(np.exp(-m.sigma_t * depth), ", ")),
+        ("transmission_depth", "float", _number(depth)),
+        ("transmission_scatter", "color3", _triple(m.sigma_s * depth, ", ")),
+        ("transmission_scatter_anisotropy", "float", _number(m.g)),
+    )  # fmt: skip
+    longest = float((1.0 / m.sigma_t).max())
+    body += _node(
+        "open_pbr_surface", f"{name}_subsurface", "surfaceshader",
+        *shared,
+        ("subsurface_weight", "float", "1"),
+        ("subsurface_color", "color3", _triple(m.colour(), ", ")),
+        ("subsurface_radius", "float", _number(longest)),
+        ("subsurface_radius_scale", "color3", _triple(1.0 / m.sigma_t / longest, ", ")),
+        ("subsurface_scatter_anisotropy", "float", _number(m.g)),
+    )  # fmt: skip
+    for kind in ("volume", "subsurface"):
+        body += _node(
+            "surfacematerial", f"{name}_{kind}_material", "material",
+            ("surfaceshader", "surfaceshader", f"@{name}_{kind}"),
+        )  # fmt: skip
+    said = request.notes() + request.depth()
+    said.append("take _volume where the renderer traces inside closed meshes, _subsurface where it does not")
+    return _document(said, body)
+
+
+def materialx(request: Request) -> str:
+    """Return a MaterialX document of a volume of one anisotropic VDF or of a mix of two [2]."""
+    m, name = request.medium, request.name
+    lobes = m.lobes(request.lobes)
+    body: list[str] = []
+    for number, (_, g) in enumerate(lobes, 1):
+        body += _node(
+            "anisotropic_vdf", f"{name}_lobe{number}", "VDF",
+            ("absorption", "vector3", _triple(m.sigma_a, ", ")),
+            ("scattering", "vector3", _triple(m.sigma_s, ", ")),
+            ("anisotropy", "float", _number(g)),
+        )  # fmt: skip
+    whole = f"{name}_lobe1"
+    if len(lobes) == 2:
+        whole = f"{name}_lobes"
+        body += _node(
+            "mix", whole, "VDF",
+            ("fg", "VDF", f"@{name}_lobe1"), ("bg", "VDF", f"@{name}_lobe2"), ("mix", "float", _number(lobes[0][0])),
+        )  # fmt: skip
+    body += _node("volume", f"{name}_volume", "volumeshader", ("vdf", "VDF", f"@{whole}"))
+    body += _node(
+        "volumematerial", f"{name}_material", "material", ("volumeshader", "volumeshader", f"@{name}_volume")
+    )  # fmt: skip
+    return _document(request.notes(len(lobes)) + request.depth(), body)
+
+
+def arnold(request: Request) -> str:
+    """Return an Arnold standard_volume, which has one lobe, as .ass text."""
+    m = request.medium
+    density = float(m.sigma_t.max())
+    n = request.bounces
+    lines = [f"# {note}" for note in request.notes() + request.depth()]
+    lines += [
+        f"# options: GI_volume_depth {n}, GI_total_depth {n}; polymesh: step_size > 0 makes it a volume",
+        "standard_volume",
+        "{",
+        f" name {request.name}",
+        f" density {_number(density)}",
+        " scatter 1",
+        f" scatter_color {_triple(m.sigma_s / m.sigma_t)}",
+        f" scatter_anisotropy {_number(m.g)}",
+        f" transparent {_triple(np.exp(-m.sigma_t / density))}",
+        " transparent_depth 1",
+        ' emission_mode "none"',
+        "}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def karma(request: Request) -> str:
+    """Return the parameters of the Karma Volume node (kma_volume), which mixes two lobes."""
+    m = request.medium
+    lobes = m.lobes(request.lobes)
+    n = request.bounces
+    lines = [f"# {note}" for note in request.notes(len(lobes)) + request.depth()]
+    lines += [
+        f"# Render settings: volume limit {n}",
+        "[Karma Volume]",
+        f"Absorption = {_triple(m.sigma_a)}",
+        f"Scattering = {_triple(m.sigma_s)}",
+        f"Anisotropy = {_number(lobes[0][1])}",
+    ]
+    if len(lobes) == 2:
+        lines += [f"Secondary Anisotropy = {_number(lobes[1][1])}", f"Secondary Mix = {_number(lobes[1][0])}"]
+    return "\n".join(lines) + "\n"
+
+
+def facts(medium: Bulk) -> dict[str, float | list[float]]:
+    """Return the medium as plain numbers."""
+    lobes = medium.lobes(2)
+    return {
+        "packing_fraction": medium.packing_fraction,
+        "radius": medium.radius,
+        "absorption": list(medium.absorption),
+        "sigma_t": medium.sigma_t.tolist(),
+        "sigma_s": medium.sigma_s.tolist(),
+        "sigma_a": medium.sigma_a.tolist(),
+        "g": medium.g,
+        "two_lobe_weight": lobes[0][0],
+        "two_lobe_g": [g for _, g in lobes],
+    }
+
+
+def csv_text(request: Request) -> str:
+    """Return statistics, medium and masses as CSV: quantity, column's cell of cos theta, row's cell, value."""
+    table, text = request.medium.table, io.StringIO()
+    text.writelines(f"# {note}\n" for note in request.notes())
+    sheet = csv.writer(text, lineterminator="\n")
+    sheet.writerow(["quantity", "cos_theta_low", "cos_theta_high", "low", "high", "value"])
+    for group, values in (("statistics", thawed(table.statistics)), ("medium", facts(request.medium))):
+        for name, value in values.items():
+            numbers = {f"[{i}]": v for i, v in enumerate(value)} if isinstance(value, list) else {"": value}
+            for index, number in numbers.items():
+                sheet.writerow([f"{group}.{name}{index}", "", "", "", "", number])
+    columns = table.cos_theta_edges.tolist()
+    cells = list(pairwise(columns))
+    for cell, mass in zip(cells, table.p_theta.tolist(), strict=True):
+        sheet.writerow(["p_theta", *cell, "", "", mass])
+    for name in CONDITIONALS:
+        edges = table.edges(name).tolist()
+        for (low, high), row in zip(pairwise(edges), table.block(name).astype(float).tolist(), strict=True):
+            sheet.writerows([name, *cell, low, high, mass] for cell, mass in zip(cells, row, strict=True))
+    return text.getvalue()
+
+
+def write_npz(request: Request, path: str | os.PathLike[str]) -> None:
+    """Write all blocks of the table by name, edges, header and medium as NumPy arrays; nothing in it is pickled.
+
+    Texts (`header`, `medium`: JSON; `notes`: lines) are arrays of text. The same request gives the same bytes.
+
+    Raises
+    ------
+    TSDFError
+        If the file cannot be written.
+    """
+    table = request.medium.table
+    arrays = {block["name"]: table.block(block["name"]) for block in table.header["blocks"]}
+    arrays |= {f"{name}_edges": table.edges(name) for name in CONDITIONALS}
+    arrays |= {
+        "cos_theta_edges": table.cos_theta_edges,
+        "header": np.array(json.dumps(thawed(table.header), sort_keys=True)),
+        "medium": np.array(json.dumps(facts(request.medium))),
+        "notes": np.array(request.notes()),
+    }
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+TEXTS: dict[str, Callable[[Request], str]] = {
+    "pbrt": pbrt,
+    "blender": blender,
+    "openpbr": openpbr,
+    "materialx": materialx,
+    "arnold": arnold,
+    "karma": karma,
+    "csv": csv_text,
+}
