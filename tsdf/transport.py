@@ -195,12 +195,12 @@ def offset_of(media, tables, c, column, key):
 
 
 @njit(**KERNEL)
-def connect(w, amounts, m, p, d, c, key, share, safe, media, tables, lights, shadow, its_amounts):
+def connect(w, amounts, m, p, d, c, key, share, bound, media, tables, lights, shadow, its_amounts):
     """Start in `shadow` light that arrives from a light and is deflected into the walker's path by a grain; return
     whether there is any.
 
     The grain, of component c in medium m, is entered at p by a walker along d. `share` is the probability that this is
-    done at all; without `safe` the jump may meet something.
+    done at all; nothing is nearer than `bound`.
     """
     key = mix(key ^ OTHER)
     u0, u1 = halves(key)
@@ -245,7 +245,7 @@ def connect(w, amounts, m, p, d, c, key, share, safe, media, tables, lights, sha
     cast(w, shadow, p, toward, light, weight, m, key)
     size = math.sqrt(dot(offset, offset))
     if size > 0.0:
-        if safe:
+        if size < bound:
             write(shadow.p, step(p, 1.0, offset))
         else:
             aim(shadow, offset, size, toward, amount, c)
@@ -308,8 +308,8 @@ def lives(w, key):
 def wander(w, amounts, once, out, out_amounts, live, most, g, media, tables, lights, absorption, counters):
     """Take a walker that is in a known medium from event to event while nothing else can be met.
 
-    With `once` it is known that the walker reaches the end of its free path, but not what it may meet from there: one
-    event. The draws are written out here, for a kernel that takes `tables` and is called once per event spends half of
+    With `once` it is known that the walker reaches the end of its free path: one event. A jump that may meet something
+    is left to `land`. The draws are written out here, for a kernel that takes `tables` and is called once per event spends half of
     its time on counting references.
 
     Returns
@@ -324,16 +324,15 @@ def wander(w, amounts, once, out, out_amounts, live, most, g, media, tables, lig
     model, mean, reach, travel, sampled = media.model, media.free[m], media.reach[m], media.travel[m], lights.sampled
     first, last = media.first[m], media.first[m] + media.kinds[m] - 1
     luck, pdf, steps, state = w.luck, w.pdf, 0, 0
-    bound = 0.0 if once else clearance(g, m, p)
-    fresh = True
+    bound, fresh = clearance(g, m, p), True
     while True:
         if free < 0.0:
             key += GOLDEN
             free = -mean * math.log(1.0 - unit(mix(key)))
-        if not once and bound < free + reach:
+        if not once and bound <= free:
             if not fresh:
                 bound = clearance(g, m, p)
-            if bound < free + reach:
+            if bound <= free:
                 break
         if steps >= PATIENCE or live >= most:
             state = 1
@@ -355,12 +354,12 @@ def wander(w, amounts, once, out, out_amounts, live, most, g, media, tables, lig
                 c += 1
         slot, scale = media.slot[c], media.scale[c]
         if sampled:
-            if not once and bound < 8.0 * mean:
+            if bound < 8.0 * mean:
                 bound = max(bound, clearance(g, m, p))
-            share = 1.0 if once else min(1.0, math.exp((reach - bound) / mean))
+            share = min(1.0, math.exp((reach - bound) / mean))
             key += GOLDEN
             if unit(mix(key)) < share:
-                live += connect(w, amounts, m, p, d, c, key, share, not once, media, tables, lights,
+                live += connect(w, amounts, m, p, d, c, key, share, bound, media, tables, lights,
                                 out[live], out_amounts[live])  # fmt: skip
 
         key += GOLDEN
@@ -397,10 +396,11 @@ def wander(w, amounts, once, out, out_amounts, live, most, g, media, tables, lig
             luck += absorption.least[slot] * length
         if reach > 0.0:
             size = scale * math.sqrt(dot(offset, offset))
-            if once and clearance(g, m, p) <= size:
-                if size > 0.0:
-                    aim(w, offset, size, d, length, c)
-                    d = triple(w.d)
+            if bound <= size:
+                bound = clearance(g, m, p)
+            if bound <= size and size > 0.0:
+                aim(w, offset, size, d, length, c)
+                once = True
             else:
                 p = step(p, scale, offset)
                 bound -= size
