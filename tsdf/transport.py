@@ -309,8 +309,8 @@ def wander(w, amounts, once, out, out_amounts, live, most, g, media, tables, lig
     """Take a walker that is in a known medium from event to event while nothing else can be met.
 
     With `once` it is known that the walker reaches the end of its free path: one event. A jump that may meet something
-    is left to `land`. The draws are written out here, for a kernel that takes `tables` and is called once per event spends half of
-    its time on counting references.
+    is left to `land`. The draws are written out here: a kernel that takes `tables` and is called once per event takes
+    twice the time.
 
     Returns
     -------
