@@ -25,22 +25,23 @@ demo: .venv/installed  ## build tables, validate and plot them, render the scene
 	$(BIN)/tsdf-plot demo/snow.tsdf.exr --out demo/snow.png
 	$(BIN)/tsdf-validate demo/zhou2003.tsdf.exr --plot demo/zhou2003.png
 	$(BIN)/tsdf-validate demo/sphere.tsdf.exr demo/snow.tsdf.exr demo/sand.tsdf.exr demo/clear.tsdf.exr demo/glass.tsdf.exr
-	$(MAKE) --no-print-directory pictures INTO=demo WIDTH=320 SECONDS=20
+	$(MAKE) --no-print-directory pictures INTO=demo WIDTH=320
 	@echo "tables, plots and pictures are in demo/"
 
 gallery: demo  ## render the scenes large into gallery/; SECONDS=900 is the time for each picture
 	mkdir -p gallery
-	$(MAKE) --no-print-directory pictures INTO=gallery WIDTH=1280 SECONDS=$(or $(SECONDS),900)
+	$(MAKE) --no-print-directory pictures INTO=gallery WIDTH=1280 STOP="--seconds $(or $(SECONDS),900)"
 
 pictures:
 	$(BIN)/python scenes/make_assets.py
-	$(BIN)/tsdf-render scenes/snow.toml --out $(INTO)/snow_heap.exr --width $(WIDTH) --seconds $(SECONDS)
-	$(BIN)/tsdf-render scenes/sand.toml --out $(INTO)/sand_dune.exr --width $(WIDTH) --seconds $(SECONDS)
+	$(BIN)/tsdf-render scenes/snow.toml --out $(INTO)/snow_heap.exr --width $(WIDTH) $(STOP)
+	$(BIN)/tsdf-render scenes/sand.toml --out $(INTO)/sand_dune.exr --width $(WIDTH) $(STOP)
 	for level in explicit teleport volume; do \
 		$(BIN)/tsdf-render scenes/beads.toml --level $$level --out $(INTO)/beads_$$level.exr --width $(WIDTH) \
-			--seconds $(SECONDS) || exit; done
+			$(STOP) || exit; done
 	$(BIN)/python scenes/side_by_side.py $(INTO)/beads_explicit.exr $(INTO)/beads_teleport.exr \
 		$(INTO)/beads_volume.exr $(INTO)/beads.png
+	$(BIN)/python scenes/plate.py $(INTO)/snow_heap.png $(INTO)/sand_dune.png $(INTO)/beads_explicit.png $(INTO)/scenes.png
 
 test: .venv/installed  ## run the tests
 	$(BIN)/python -m pytest

@@ -59,18 +59,13 @@ def main(
     if seed is not None and not 0 <= seed < 2**63:
         raise UsageError(f"--seed is a whole number from 0 to 2^63 - 1, not {seed}")
 
-    from dataclasses import replace
-
     from tqdm import tqdm
 
     from tsdf import compare, plots
     from tsdf.files import replacing
-    from tsdf.scene import load
+    from tsdf.scene import load, resized
 
-    read = load(scene)
-    if width is not None:
-        height = max(1, round(read.camera.height * width / read.camera.width))
-        read = replace(read, camera=replace(read.camera, width=width, height=height))
+    read = resized(load(scene), width)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -80,6 +75,7 @@ def main(
         save(world, picture, own, out / f"{name}.exr")
 
     def stop(*_: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # signals come twice, and the second is no other
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGTERM, stop)

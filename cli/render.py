@@ -58,17 +58,12 @@ def main(
     if sum(stop is not None for stop in (spp, seconds, target_error)) > 1:
         raise UsageError("--spp, --seconds and --target-error each say when to stop: give one")
 
-    from dataclasses import replace
-
     from tqdm import tqdm
 
     from tsdf import render, world
-    from tsdf.scene import load
+    from tsdf.scene import load, resized
 
-    read = load(scene)
-    if width is not None:
-        height = max(1, round(read.camera.height * width / read.camera.width))
-        read = replace(read, camera=replace(read.camera, width=width, height=height))
+    read = resized(load(scene), width)
     made = world.build(read, level or read.render.level)
     if not quiet:
         for note in made.notes:
@@ -104,8 +99,6 @@ def main(
 
 def save(world: "World", picture: "Picture", seed: int, out: Path) -> None:
     """Write the EXR, with what it was made by as the attribute ``tsdf_render``, and the PNG beside it."""
-    import numpy as np
-
     from tsdf import estimate, image
 
     facts = {
@@ -118,8 +111,7 @@ def save(world: "World", picture: "Picture", seed: int, out: Path) -> None:
         "faults": picture.faults,
         "software": estimate.software(),
     }
-    variance = np.where(np.isfinite(picture.variance), picture.variance, 0.0)
-    image.write_exr(out, picture.rgb, variance, {"tsdf_render": json.dumps(facts)})
+    image.write_exr(out, picture.rgb, picture.variance, {"tsdf_render": json.dumps(facts)})
     image.write_png(out.with_suffix(".png"), picture.rgb, world.scene.camera.exposure)
 
 

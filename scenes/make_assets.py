@@ -79,30 +79,34 @@ def snow_heap() -> tuple[Array, Array]:
     """A heap thrown up by a shovel, 0.35 m in radius."""
 
     def height(x: Array, y: Array) -> Array:
-        r = np.hypot(x, y)
-        fade = np.clip(1.0 - r**2, 0.0, 1.0)
-        bumps = 0.055 * waves(x, y, 9, 0.85, 1) + 0.022 * waves(x, y, 14, 0.3, 2) + 0.007 * waves(x, y, 20, 0.11, 3)
-        return 0.006 + (0.62 * fade**1.15 * (1.0 + 0.15 * x) + bumps * fade).clip(0.0)
+        foot = np.clip(1.0 - np.hypot(x, y) ** 2, 0.0, 1.0)
+        body = 0.58 * foot**1.25 * np.exp(-0.5 * ((x + 0.15) ** 2 + (y - 0.1) ** 2))
+        lumps = 0.070 * waves(x, y, 9, 0.8, 1) + 0.018 * waves(x, y, 14, 0.3, 2) + 0.008 * waves(x, y, 20, 0.1, 3)
+        return 0.006 + (body + foot * lumps * (0.4 + body)).clip(0.0)
 
     return mound(0.35, 90, 160, height)
 
 
 def sand_dune() -> tuple[Array, Array]:
-    """A dune with a sharp crest and ripples, 2.4 by 1.8, in metres."""
-    x, y = np.meshgrid(np.linspace(-1.2, 1.2, 200), np.linspace(-0.9, 0.9, 130), indexing="ij")
-    crest = 0.15 + 0.22 * np.sin(1.6 * x + 0.5)  # where along y
-    across = y - crest
-    windward, lee = 0.34 + 0.36 * across, 0.34 - 0.62 * across
-    body = np.minimum(windward, lee)
-    body = np.maximum(body, 0.05 + 0.02 * waves(x, y, 6, 1.2, 5))
-    phase = 2.0 * np.pi * (y + 0.1 * np.sin(2.1 * x) + 0.03 * waves(x, y, 6, 0.5, 7)) / 0.075
-    ripples = 0.0042 * (np.sin(phase) + 0.25 * np.sin(2.0 * phase + 0.6)) * np.clip(1.3 - 9.0 * across, 0.0, 1.0)
-    return heightfield(x, y, body + ripples + 0.001 * waves(x, y, 30, 0.15, 8))
+    """A dune whose crest winds away along +y, in metres: a slope with ripples toward -x, a steep smooth one toward +x.
+
+    A column of its grid lies on the crest, which is sharp thereby, and the grid widens with the distance.
+    """
+    far, side = np.meshgrid(np.linspace(0.0, 1.0, 150) ** 1.5, np.linspace(-1.0, 1.0, 171), indexing="xy")
+    y = -1.6 + 6.6 * far
+    across = side * np.where(side < 0.0, 1.6, 1.1) * (1.0 + 2.4 * far)  # from the crest
+    x = 0.28 * np.sin(1.15 * y + 0.4) + 0.12 * y + across
+    top = 0.38 + 0.24 * np.exp(-(((y - 1.3) / 1.3) ** 2)) + 0.2 * far
+    body = top + np.where(across < 0.0, 0.20 * across, -0.62 * across)
+    body = 0.04 + 0.03 * np.logaddexp(0.0, (body - 0.04) / 0.03) + 0.008 * waves(x, y, 6, 1.5, 5)
+    phase = 2.0 * np.pi * (across + 0.10 * np.sin(1.7 * y) + 0.02 * waves(x, y, 8, 0.6, 7)) / 0.11
+    shape = np.sin(phase) + 0.25 * np.sin(2.0 * phase + 0.6)
+    return heightfield(x, y, body + 0.008 * shape * np.clip(-6.0 * across - 0.2, 0.0, 1.0) * np.exp(-2.5 * far))
 
 
 def bead_pile() -> tuple[Array, Array]:
-    """A round pile, 22 mm in radius: eleven bead diameters of 2 mm."""
-    return mound(22.0, 24, 72, lambda x, y: 0.12 + 0.36 * (1.0 - x * x - y * y).clip(0.0) ** 0.8)
+    """A round pile, 15 mm in radius and 9 mm high, of beads of 2 mm diameter."""
+    return mound(15.0, 24, 72, lambda x, y: 0.17 + 0.42 * (1.0 - np.hypot(x, y) ** 1.6).clip(0.0))
 
 
 def directions(height: int) -> tuple[Array, Array, Array]:
@@ -112,7 +116,7 @@ def directions(height: int) -> tuple[Array, Array, Array]:
     return np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar) * np.ones(2 * height)
 
 
-def gradient(zenith: Array, horizon: Array, ground: Array, height: int = 64) -> Array:
+def gradient(zenith: Array, horizon: Array, ground: Array, height: int = 256) -> Array:
     """Return a sky that goes from the zenith's colour to the horizon's, and the ground's below."""
     up = directions(height)[2][..., None]
     share = np.clip(up, 0.0, 1.0) ** 0.5
@@ -125,23 +129,23 @@ def blue_sky() -> Array:
 
 
 def evening_sky() -> Array:
-    """A low sun's sky, warm on its side (+x) and blue on the other."""
-    x, _, z = directions(64)
-    sky = gradient(np.array((0.12, 0.19, 0.36)), np.array((0.42, 0.42, 0.46)), np.array((0.16, 0.11, 0.07)))
-    glow = np.exp(-((1.0 - x) / 0.35)) * np.exp(-np.abs(z) / 0.25) * (z > 0.0)
+    """A low sun's sky, warm on its side (-x) and blue on the other."""
+    x, _, z = directions(256)
+    sky = gradient(np.array((0.16, 0.26, 0.50)), np.array((0.62, 0.54, 0.48)), np.array((0.16, 0.11, 0.07)))
+    glow = np.exp(-((1.0 + x) / 0.35)) * np.exp(-np.abs(z) / 0.25) * (z > 0.0)
     return sky + glow[..., None] * (1.2, 0.62, 0.22)
 
 
 def studio() -> Array:
-    """A dim room with a bright overhead panel, a window with a cross and a warm strip."""
+    """A bright room with an overhead panel, a window with a cross and a warm strip."""
     x, y, z = directions(128)
     azimuth, elevation = np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z))
-    room = gradient(np.array((0.10, 0.11, 0.13)), np.array((0.18, 0.18, 0.19)), np.array((0.05, 0.05, 0.05)), 128)
+    room = gradient(np.array((0.5, 0.52, 0.56)), np.array((0.30, 0.30, 0.31)), np.array((0.05, 0.05, 0.05)), 128)
     window = (np.abs(azimuth - 125.0) < 32.0) & (np.abs(elevation - 38.0) < 22.0)
     cross = (np.abs(azimuth - 125.0) < 2.0) | (np.abs(elevation - 38.0) < 1.6)
-    room[window & ~cross] = (5.2, 6.0, 7.0)
-    room[(np.abs(azimuth + 40.0) < 9.0) & (np.abs(elevation - 35.0) < 30.0)] = (7.0, 4.4, 2.4)
-    room[(elevation > 72.0)] = (2.5, 2.5, 2.5)
+    room[window & ~cross] = (2.9, 3.4, 4.0)
+    room[(np.abs(azimuth + 40.0) < 9.0) & (np.abs(elevation - 35.0) < 30.0)] = (4.5, 2.8, 1.5)
+    room[(elevation > 72.0)] = (1.8, 1.8, 1.8)
     return room
 
 

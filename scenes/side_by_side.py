@@ -57,7 +57,7 @@ def side_by_side(pictures: Sequence[Path], out: Path, exposure: float = 0.0) -> 
     truth, *others = shown = [image.read_exr(path) for path in pictures]
     found = [difference(one, truth) for one in others]
     height, width = truth.rgb.shape[:2]
-    figure = Figure(figsize=(15.0, 10.0 * height / width + 1.4), layout="constrained")
+    figure = Figure(figsize=(12.0, 8.0 * height / width + 1.2), layout="constrained")
     FigureCanvasAgg(figure)
     top, bottom = figure.subplots(2, 3)
     for axes, name, one in zip(top, NAMES, shown, strict=True):
@@ -67,12 +67,14 @@ def side_by_side(pictures: Sequence[Path], out: Path, exposure: float = 0.0) -> 
     for axes, name, one in zip(bottom[1:], NAMES[1:], found, strict=True):
         plate = axes.imshow(one.per_pixel, vmin=0.0, vmax=most, cmap="magma")
         axes.set_title(
-            f"|{name} - explicit|: mean {one.error:.1%} (noise {one.noise:.1%}), of the means {one.bias:+.1%}"
+            f"|{name} - explicit|\nmean {one.error:.1%} (noise {one.noise:.1%}), of the means {one.bias:+.1%}",
+            fontsize=9,
         )
     for axes in (*top, *bottom):
         axes.set_axis_off()
-    figure.colorbar(plate, ax=bottom[0], location="right", label="|difference| / mean of explicit, luminance")
-    figure.savefig(out, dpi=100, metadata={"Software": None})
+    bar = bottom[0].inset_axes((0.1, 0.5, 0.8, 0.08))
+    figure.colorbar(plate, cax=bar, orientation="horizontal", label="|difference| / mean of explicit, luminance")
+    figure.savefig(out, dpi=80, metadata={"Software": None})
     return found[0], found[1]
 
 

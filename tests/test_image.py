@@ -2,6 +2,8 @@
 
 import math
 import re
+import subprocess
+import sys
 import warnings
 
 import numpy as np
@@ -30,6 +32,15 @@ def written(path, channels, **header):
 
 
 # ------------------------------------------------------------------------------------------------ EXR
+
+
+def test_colour_science_changes_nothing_else() -> None:
+    """Its import sets numpy's way of printing, on which other people's output and our golden files depend."""
+    code = (
+        "import numpy as np; before = np.get_printoptions(); from tsdf import image; image.spectral_weights(); "
+        "assert np.get_printoptions() == before"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_round_trip(tmp_path):

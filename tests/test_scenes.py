@@ -2,12 +2,14 @@
 
 import tomllib
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from scenes import make_assets
+from scenes.plate import plate
 from scenes.side_by_side import difference, side_by_side
 from tsdf import image, render, scene, world
 from tsdf.grains import load_grain, read_mesh
@@ -29,6 +31,11 @@ def assets(tmp_path_factory):
     return folder
 
 
+@cache
+def ball():
+    return exact_sphere(load_grain("sphere"), Optics(1.5), Effort(cells=256, joint=32))
+
+
 def loaded(name, folder, width):
     """The shipped scene, small, with the table of a sphere for each of its grains: tables are made by `make demo`."""
     data = tomllib.loads((FOLDER / f"{name}.toml").read_text())
@@ -38,9 +45,8 @@ def loaded(name, folder, width):
         for grain in medium["grain"]:
             grain["table"] = stand_in.name
     made = scene.parse(data, folder, name)
-    table = exact_sphere(load_grain("sphere"), Optics(1.5), Effort(cells=256, joint=32))
     media = tuple(
-        replace(medium, grains=tuple(replace(grain, table=table) for grain in medium.grains)) for medium in made.media
+        replace(medium, grains=tuple(replace(grain, table=ball()) for grain in medium.grains)) for medium in made.media
     )
     return replace(made, media=media, camera=replace(made.camera, width=width, height=max(1, width * 9 // 16)))
 
@@ -69,10 +75,46 @@ def test_the_meshes_are_closed_and_wound_outward(assets):
         assert vertices[:, 2].min() == 0.0, name
 
 
+def test_one_ball_lies_under_the_snow_and_one_half_in_it(assets):
+    """The blue ball is inside the heap, 2 to 6 mm below its surface, so that it shines through and nothing of it stands
+    out; the red one crosses the surface: the negative control."""
+    import trimesh
+
+    vertices, faces = read_mesh(assets / "assets" / "snow_heap.ply")
+
+    def cover(ball):
+        """Distance from a ball, whose centre is inside, to the surface [m]."""
+        centre = np.array(ball.shape.centre)
+        nearest = trimesh.triangles.closest_point(vertices[faces], np.tile(centre, (len(faces), 1)))
+        nearest = nearest[np.linalg.norm(nearest - centre, axis=1).argmin()]
+        above = vertices[np.hypot(*(vertices - centre)[:, :2].T).argsort()[:3], 2].max()
+        assert ball.name == "red ball" or above > centre[2] + ball.shape.radius
+        return np.linalg.norm(nearest - centre) - ball.shape.radius
+
+    balls = {surface.name: cover(surface) for surface in loaded("snow", assets, 8).surfaces if "ball" in surface.name}
+    assert 0.002 < balls["blue ball"] < 0.006
+    assert balls["red ball"] < -0.02
+
+
 def test_assets_are_the_same_every_time(assets, tmp_path):
     """Two makings give the same bytes."""
     for path in make_assets.make(tmp_path):
         assert path.read_bytes() == (assets / "assets" / path.name).read_bytes(), path.name
+
+
+def test_a_plate_holds_its_pictures_in_order(tmp_path):
+    """Two small pictures come out beside each other, the first on the left; another size is refused."""
+    from matplotlib import image as png
+
+    red, blue = np.zeros((2, 3, 4, 3))
+    red[..., 0], blue[..., 2] = 1.0, 1.0
+    paths = [tmp_path / name for name in ("red.png", "blue.png", "tall.png", "plate.png")]
+    for path, picture in zip(paths, (red, blue, np.zeros((5, 4, 3))), strict=False):
+        png.imsave(path, picture)
+    plate(paths[:2], paths[3])
+    assert np.array_equal(png.imread(paths[3])[..., :3], np.concatenate((red, blue), axis=1))
+    with pytest.raises(SystemExit, match="not of the same size"):
+        plate(paths[1:3], paths[3])
 
 
 def test_difference_tells_noise_from_error(tmp_path):

@@ -259,13 +259,35 @@ LEAKS = ("walls on the boundary", "boundary beyond the walls", "floor on the bou
          "two sheets", "hollow box", "wedge")  # fmt: skip
 
 
+def meshed(scene: Scene, folder: Path) -> Scene:
+    """Return a scene whose box of grains is a mesh."""
+    import trimesh
+
+    (medium,) = scene.media
+    trimesh.creation.box(bounds=[medium.shape.low, medium.shape.high]).export(folder / "as_mesh.ply")
+    return replace(scene, media=(replace(medium, shape=Mesh(folder / "as_mesh.ply")),))
+
+
 @pytest.mark.parametrize("level", JUMPING)
+@pytest.mark.parametrize("boundary", ["exact", "mesh"])
 @pytest.mark.parametrize("name", LEAKS)
-def test_nothing_leaks(name, level, folder, ball):
+def test_nothing_leaks(name, boundary, level, folder, ball):
     """Light on one side, the camera on the other, walls between that no light passes: exactly 0, for walls thinner than
     a grain, on a boundary, across it, and that meet in a sharp edge. 5e3 to 2e4 paths each."""
-    picture = take(leaks(name, folder, ball), level, 100)
+    scene = leaks(name, folder, ball)
+    picture = take(scene if boundary == "exact" else meshed(scene, folder), level, 100)
     assert (picture.rgb == 0.0).all()
+
+
+def test_a_boundary_just_before_a_wall(folder, ball):
+    """A flat ray through the facet of a boundary 1e-4 or less before it meets a wall must not be moved beyond it."""
+    wall = black(Rectangle((1.0, 0.0, 4.0), (0.0, 50.0, 0.0), (0.0, 0.0, 50.0)))
+    scene = meshed(scene_of([BOX], ball, wall, lights=ONE), folder)
+    made = world.build(scene, "teleport")
+    d = np.array([1.0, 0.0, -0.005])
+    for before in (1e-5, 5e-5, 1e-4):
+        at = np.array([1.0 - before, 0.0, 4.0])
+        assert (render.measure(made, world.beam(made, at - d, d), spp=100).rgb == 0.0).all()
 
 
 def test_leaks_would_be_seen(folder, ball):

@@ -324,6 +324,9 @@ def compare(
             if done is not None and known:
                 spread = np.var([p.rgb for p in references], axis=0, ddof=1) / len(references)
                 done("reference", world, replace(rows[0].picture, variance=spread), _seed(seed, level, 0))
+        lit = any(p.rgb.any() for p in references)
+        if references and not lit:
+            notes.append("the reference is black, and nothing is relative to that; give the scene light")
         for name in others:
             if stop.is_set():
                 break
@@ -335,7 +338,7 @@ def compare(
                 continue
             picture = shot(other, 0, name, spp, seconds)
             if picture is not None:
-                rows.append(Row(name, picture, difference(picture, references)))
+                rows.append(Row(name, picture, difference(picture, references) if lit else None))
                 if done is not None:
                     done(name, other, picture, _seed(seed, name, 0))
     except KeyboardInterrupt:

@@ -240,10 +240,12 @@ def spectral_weights(wavelengths: tuple[float, ...] | None = None) -> Spectrum:
 
 
 def _colour() -> Any:
-    """Return colour-science, which warns of every optional package that is not there."""
+    """Return colour-science, which on import warns of what is not there and changes how numpy prints numbers."""
+    printed = np.get_printoptions()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import colour
+    np.set_printoptions(**printed)
     return colour
 
 

@@ -228,11 +228,11 @@ def draw(lights, u0, u1, u2):
     -------
     direction : triple of float
     pdf : float
-        Density of the whole mixture [1/sr], more than 0.
+        Density of the whole mixture [1/sr]; 0, with no radiance, where nothing is drawn.
     rgb : triple of float
     """
     if not lights.sampled:
-        return (0.0, 0.0, 1.0), 1.0, (0.0, 0.0, 0.0)
+        return (0.0, 0.0, 1.0), 0.0, (0.0, 0.0, 0.0)
     chosen = _cell(lights.shares, u0)[0]
     if chosen == 0:
         row, down = _cell(lights.rows, u1 * lights.rows[-1])
@@ -252,5 +252,5 @@ def draw(lights, u0, u1, u2):
         direction = step(step(step(centre, -drop, centre), rho * c, s), rho * d, t)
     r, g, b, density = _sent(lights, direction)
     if density <= 0.0:  # rounding can carry an edge to where nothing is drawn
-        return direction, 1.0, (0.0, 0.0, 0.0)
+        return direction, 0.0, (0.0, 0.0, 0.0)
     return direction, density, (r, g, b)

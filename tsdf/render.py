@@ -2,7 +2,8 @@
 
 How a sample is followed is `transport`, what it is followed through is `world`. A sample's random numbers are a
 function of (seed, pixel, number of the sample), and blocks of samples are the same whatever the number of threads, so
-a picture of so many samples is the same to the last bit for any number of threads.
+a picture of so many samples (`spp`) is the same to the last bit for any number of threads; one that the clock stopped
+is not.
 """
 
 import math
@@ -17,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tsdf import transport as T
-from tsdf.errors import UsageError
+from tsdf.errors import SceneError, UsageError
 from tsdf.transport import Camera
-from tsdf.world import World, camera_of
+from tsdf.world import World, camera_of, sees
 
 SLOTS = 2048  # walkers under way at once, per thread, but for shadows: their state stays in the second-level cache
 ROOM = 4 * SLOTS
@@ -27,6 +28,7 @@ BLOCK = 65536  # samples of a block, about: the last few walkers of each wait fo
 LEAST = 4096  # samples of a block, however few are asked for
 PARTS = 16  # of a pass, so that threads have something to share; and of the time, so that it is kept
 FEW = 16  # samples per pixel of a pass of a large picture; the first has one, so that soon no pixel is black
+BLACK = 256  # samples per pixel after which a black picture needs no smaller error
 GROWTH = 8  # of a pass over the one before it, at most, while it is not known how long they take
 
 
@@ -151,6 +153,10 @@ def render(
         Set by others to end early; the picture then holds the samples so far.
     """
     camera = world.scene.camera
+    if not sees(world):
+        raise SceneError(
+            f"{world.scene.name}: a camera looking at nothing: it sees neither a medium nor a surface; move its target"
+        )
     return measure(
         world, camera_of(world), camera.width, camera.height, spp, seconds, target_error, seed, threads, progress, stop
     )
@@ -218,7 +224,8 @@ def measure(
         if not share:
             return 1
         left = seconds - (time.perf_counter() - begin)
-        return int(min(share * min(left, seconds / PARTS) / max(took, 1e-6), most, GROWTH * share))
+        each = max(took, 1e-6) / share  # of a pass of one sample
+        return min(max(int(min(left, seconds / PARTS) / each), int(left >= each)), most, GROWTH * share)
 
     def blocks(share: int) -> Iterator[tuple[int, int, int, int]]:
         """First pixel, pixels, samples of each and the number of the first, one block of a pass after the other."""
@@ -229,7 +236,7 @@ def measure(
             for pixel in range(0, count, step):
                 yield pixel, min(step, count - pixel), min(number, done + share - sample), sample
 
-    done, share, took = 0, 0, 0.0
+    done, share, took, reached = 0, 0, 0.0, math.inf
     waiting: deque[tuple[tuple[int, int, int, int], Future]] = deque()
     with ThreadPoolExecutor(threads) as executor:
         try:
@@ -254,11 +261,17 @@ def measure(
                         part = (done + found / count) / spp if spp else 0.0
                         if seconds is not None:
                             part = min(1.0, (time.perf_counter() - begin) / seconds)
+                        if target_error is not None and done > 1:
+                            part = min(1.0, (target_error / reached) ** 2)
                         progress(part, f"{done + found // count} spp")
                 else:
                     break
                 took, done = time.perf_counter() - start, done + share
-                if target_error is not None and done > 1 and picture(False).relative_error <= target_error:
+                if target_error is not None and done > 1:
+                    reached = max(picture(False).relative_error, 1e-9)
+                    if reached <= target_error:
+                        break
+                if target_error is not None and done >= BLACK and not total.any():
                     break
         except KeyboardInterrupt:
             stop.set()

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tsdf import image
 from tsdf.errors import SceneError, UsageError
 from tsdf.materials import MEDIA, optical_constants
 from tsdf.medium import MAX_PACKING_FRACTION
@@ -29,7 +30,7 @@ LEVELS = ("explicit", "teleport", "teleport-joint", "volume", "volume-hg", "isot
 VISIBLE_NM = (380.0, 780.0)  # [nm] what an absorption spectrum must cover
 LARGEST = 1e30  # of any number in a scene, so that squares and products stay finite
 MAX_PIXELS = 65536  # along one side of the picture
-MAX_SAMPLES = 2**31 - 1  # per pixel: indices of Sobol' points have 32 bits
+MAX_SAMPLES = 2**31 - 1  # per pixel
 METRES_PER_NM = 1e-9
 ABSORBING = tuple(name for name, medium in MEDIA.items() if medium.k is not None)
 
@@ -490,7 +491,27 @@ def _check_camera(camera: Camera, at: _Place) -> Camera:
         at.fail("up has no length; say up = [0, 0, 1]")
     if _parallel(view, up):
         at.fail("up is parallel to the view from position to target; turn it, say up = [0, 1, 0]")
+    if camera.width * camera.height > image.MAX_PIXELS:
+        at.fail(
+            f"a picture of {camera.width} x {camera.height} has more than {image.MAX_PIXELS} pixels; make it smaller"
+        )
     return camera
+
+
+def resized(scene: Scene, width: int | None) -> Scene:
+    """Return a scene whose picture has another width [pixel] and its shape; the same scene for None.
+
+    Raises
+    ------
+    UsageError
+        If that is no width or makes too many pixels.
+    """
+    if width is None:
+        return scene
+    height = max(1, round(scene.camera.height * width / scene.camera.width))
+    if width < 1 or width * height > image.MAX_PIXELS or max(width, height) > MAX_PIXELS:
+        raise UsageError(f"a width of {width} is out of range: at least 1, at most {image.MAX_PIXELS} pixels in all")
+    return replace(scene, camera=replace(scene.camera, width=width, height=height))
 
 
 def _check_sun(sun: SunLight, at: _Place) -> SunLight:

@@ -59,7 +59,7 @@ PATIENCE = 100_000  # steps of a walker before others have their turn
 MAX_EVENTS = 50_000_000  # of one path; only light that nothing lets out comes that far, and it is counted
 DIM = math.log(0.25)  # walkers dimmer than this may end
 FAINT = 0.02  # shadows fainter than this may end
-TRIES = 40  # to start a ray off a facet
+TRIES = 8  # to start a ray off a facet, each twice as far from it
 GRAZING = 100.0  # times its thickness is the most that a point is moved off a facet along a ray
 
 
@@ -540,15 +540,17 @@ def land(w, amounts, hits, out, out_amounts, live, g, media, lights, counters):
     if spurious:
         return live, again(w, slack_b, counters)
     w.skip, w.tries = 0.0, 0
-    leaves = inside and t_b < w.length
-    end = min(w.length, t_b) if leaves else w.length
+    if not inside:  # by rounding: the jump begins on the boundary
+        t_b = 0.0
+    leaves = t_b < w.length
+    end = min(w.length, t_b)
     if t < math.inf and (t - end) * abs(dot(n, e)) <= slack:
         if w.shadow:
             return live, ENDED
         if media.slot[w.component] >= 0:
             amounts[media.slot[w.component]] -= w.gained * max(0.0, 1.0 - t / w.length)
         return bounce(w, amounts, p, e, t, n, slack, surface, out, out_amounts, live, g, lights)
-    move = beyond(slack_b, dot(n_b, e))
+    move = min(beyond(slack_b, dot(n_b, e)), 0.5 * (t - t_b)) if inside else 0.0
     if leaves:
         for k in range(g.kind.shape[0]):
             t_k, inside, n_k, slack_k, spurious = boundary_met(g, k, p, e, hits, w.ray)
@@ -589,6 +591,8 @@ def fly(w, amounts, hits, out, out_amounts, live, g, media, tables, lights, grai
             t_b, n_b, slack_b = t_m, n_m, slack_m
             if inside:
                 home = m
+    if home != w.medium:
+        w.free = -1.0
     w.skip, w.tries, w.medium = 0.0, 0, home
     facing = abs(dot(n, d)) if t < math.inf else 1.0
     end = min(t, t_b)
@@ -628,7 +632,7 @@ def fly(w, amounts, hits, out, out_amounts, live, g, media, tables, lights, grai
             return live, ENDED
         return bounce(w, amounts, p, d, t, n, slack, surface, out, out_amounts, live, g, lights)
     if t_b < math.inf:
-        write(w.p, step(p, t_b + beyond(slack_b, dot(n_b, d)), d))
+        write(w.p, step(p, t_b + min(beyond(slack_b, dot(n_b, d)), 0.5 * (t - t_b)), d))
         w.medium = UNKNOWN
         w.events += 1
         if w.events > MAX_EVENTS:

@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 from tsdf import format, image
 from tsdf.errors import SceneError, TSDFError
 from tsdf.explicit import Packed, nothing_packed, packed
-from tsdf.geometry import Place, place
-from tsdf.grains import load_grain
-from tsdf.lights import LightArrays, compile_lights
+from tsdf.geometry import MESH, Place, ball_hit, exact_hit, place
+from tsdf.grains import first_hit, load_grain
+from tsdf.lights import LUMINANCE, LightArrays, compile_lights
 from tsdf.medium import Component, VolumeParameters, free_path, volume_parameters
 from tsdf.optics import Optics
 from tsdf.sampler import Tables, compile_tables
@@ -50,8 +50,8 @@ from tsdf.transport import (
 )  # fmt: skip
 from tsdf.vectors import frame
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, ITU-R BT.709
 DARKEST = 1e-300  # albedo, so that it has a logarithm
+LOOKS = 200  # pixels along each side through which it is looked whether the camera sees anything
 LONGEST_OFFSET = math.sqrt(8.0)  # [R] r and z drawn independently: at most 2 each
 
 
@@ -105,6 +105,28 @@ def camera_of(world: World) -> Camera:
     return Camera(
         _triple(position), still, still, _triple(corner), _triple(pixel * right), _triple(pixel * down), camera.width
     )
+
+
+def sees(world: World) -> bool:
+    """Return whether anything of the scene is in the picture, as far as one ray for each of some pixels tells."""
+    place, camera = world.place, camera_of(world)
+    width, height = world.scene.camera.width, world.scene.camera.height
+    x, y = ((np.arange(min(n, LOOKS)) + 0.5) * n / min(n, LOOKS) for n in (width, height))
+    ways = np.array(camera.corner) + x[:, None, None] * camera.right + y[None, :, None] * camera.down
+    ways = (ways / np.linalg.norm(ways, axis=2, keepdims=True)).reshape(-1, 3)
+    starts = np.broadcast_to(camera.origin, ways.shape)
+    if any((first_hit(engine, starts, ways) >= 0).any() for engine in place.engines):
+        return True
+    g = place.arrays
+    exact = [m for m in range(len(g.kind)) if g.kind[m] != MESH]
+    for d in map(_triple, ways):
+        if len(g.balls) and ball_hit(g.balls, camera.origin, d)[1] >= 0:
+            return True
+        for m in exact:
+            t, inside, _ = exact_hit(g.kind[m], g.shape[m], camera.origin, d)
+            if inside or t < math.inf:
+                return True
+    return False
 
 
 def beam(world: World, origin: ArrayLike, direction: ArrayLike, width: float = 0.0) -> Camera:
@@ -239,7 +261,7 @@ def _media(scene: Scene, model: int, tables: list[Table]) -> tuple[Media, Absorp
         these = range(at, at + len(medium.grains))
         components = [Component(tables[i], specs[i][1].fraction, medium.radius) for i in these]
         grey = [
-            float(LUMINANCE @ (by_channel if s is None else weight.T @ s))
+            float(np.array(LUMINANCE) @ (by_channel if s is None else weight.T @ s))
             for s, by_channel in (spectra[i] for i in these)
         ]
         path = free_path(components, medium.packing_fraction)
