@@ -437,11 +437,15 @@ def distances(corners: np.ndarray, low: np.ndarray, step: float, counts: Sequenc
     high = low + step * np.asarray(counts)
     free = np.ones(tuple(counts), bool)
     while len(corners):
-        least, most = corners.min(axis=1), corners.max(axis=1)
-        corners = corners[((most >= low) & (least <= high)).all(axis=1)]
-        edges = np.stack([np.linalg.norm(corners[:, i] - corners[:, i - 1], axis=1) for i in range(3)], axis=1)
-        small = edges.max(axis=1, initial=0.0) <= step
-        ends = [np.floor((extreme(corners[small], axis=1) - low) / step).astype(int) for extreme in (np.min, np.max)]
+        least, most = (
+            extreme(extreme(*corners[:, :2].swapaxes(0, 1)), corners[:, 2]) for extreme in (np.minimum, np.maximum)
+        )
+        reaches = ((most >= low) & (least <= high)).all(axis=1)
+        corners, least, most = corners[reaches], least[reaches], most[reaches]
+        sides = [corners[:, i] - corners[:, i - 1] for i in range(3)]
+        edges = np.stack([np.einsum("ij,ij->i", side, side) for side in sides], axis=1)  # squared
+        small = (edges <= step * step).all(axis=1)
+        ends = [np.floor((extreme[small] - low) / step).astype(int) for extreme in (least, most)]
         for choice in np.ndindex(2, 2, 2):  # a triangle no longer than a cell lies in at most eight
             cell = np.stack([ends[choice[k]][:, k] for k in range(3)])
             cell = cell[:, ((cell >= 0) & (cell < np.asarray(counts)[:, None])).all(axis=0)]
