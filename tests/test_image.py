@@ -15,9 +15,11 @@ from tsdf.errors import TSDFError, UsageError
 from tsdf.image import read_environment, read_exr, spectral_weights, write_exr, write_png
 from tsdf.materials import optical_constants
 
+PRINTED = np.get_printoptions()
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     import colour
+np.set_printoptions(**PRINTED)  # which colour-science changes
 
 SCAN = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
 

@@ -186,6 +186,7 @@ def test_a_whole_scene(folder):
         ),
         render=scene.Render("volume-hg", 16, 7),
         metres_per_unit=0.01,
+        name=str(path),
     )
     assert isinstance(got.camera.target[0], float) and isinstance(got.camera.width, int)
 
