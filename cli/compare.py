@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), metavar="DIR",
-    help="Folder to write to: levels.md, levels.csv, levels.png and a picture of each level.  [required]",
+    help="Folder to write to: levels.md, levels.csv, levels.png and a picture of each level.",
 )  # fmt: skip
 @click.option("--levels", metavar="A,B,..", help="Levels to compare.  [default: all]")
 @click.option("--spp", type=int, metavar="N", help="Samples per pixel of each level and packing.")

@@ -7,7 +7,7 @@ from tsdf.cli.common import Tool
 
 @click.command("tsdf-plot", cls=Tool)
 @click.argument("file")
-@click.option("--out", required=True, metavar="PNG|PDF", help="Picture to write; the suffix says which.  [required]")
+@click.option("--out", required=True, metavar="PNG|PDF", help="Picture to write; the suffix says which.")
 def main(file: str, out: str) -> None:
     """Draw the distributions of the table FILE, as Fig. 1 of Meng et al. 2015 does.
 

@@ -21,8 +21,7 @@ LEVELS = ("explicit", "teleport", "teleport-joint", "volume", "volume-hg", "isot
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path),
-    help="Picture to write, NAME.exr (linear RGB and the variance of each pixel); NAME.png is written beside it.  "
-    "[required]",
+    help="Picture to write, NAME.exr (linear RGB and the variance of each pixel); NAME.png is written beside it.",
 )  # fmt: skip
 @click.option("--level", type=click.Choice(LEVELS), help="How grains are modelled.  [default: the scene's]")
 @click.option("--spp", type=int, metavar="N", help="Samples per pixel.  [default: the scene's]")
