@@ -33,7 +33,7 @@ from tsdf.table import RECORD_FIELDS, Table
 LEDGER_UNITS = 1 << 52  # energy units of an exact table
 
 
-GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0  # its multiples fall evenly into [0, 1)
+SHIFT = (math.sqrt(5.0) - 1.0) / 2.0  # its multiples fall evenly into [0, 1)
 
 
 @njit(cache=True)
@@ -70,7 +70,7 @@ def _choose(weight, low, high, edges, totals, chosen):  # type: ignore[no-untype
         i = min(max(np.searchsorted(edges, a, side="right") - 1, 0), columns - 1)
         while i < columns and edges[i] <= b:
             running[i] += weight[k] * _covered(a, b, edges[i], edges[i + 1])
-            first = i * GOLDEN % 1.0
+            first = i * SHIFT % 1.0
             while taken[i] < count and running[i] > (taken[i] + first) / count * totals[i]:
                 chosen[i, taken[i]] = k
                 taken[i] += 1

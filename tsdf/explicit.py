@@ -15,11 +15,11 @@ import numpy as np
 from numba import njit
 
 from tsdf.errors import GrainError, SceneError, TSDFError
-from tsdf.geometry import MESH, SLAB, Place, exact_depth, triangle_distance, within
+from tsdf.geometry import MESH, SLAB, Place, exact_depth, planes_of, triangle_distance, within
 from tsdf.grains import Grain, embree_scene, grain_from_mesh, load_grain, read_mesh, triangle_scene
 from tsdf.optics import UNPOLARISED, P, S, fresnel
 from tsdf.packing import Cells, cells_of, next_sphere, pack
-from tsdf.sampling import key_of, mix, turn, unit
+from tsdf.sampling import GOLDEN, key_of, mix, turn, unit
 from tsdf.scene import GrainSpec, MediumSpec, Scene
 from tsdf.table import Table
 from tsdf.vectors import KERNEL, dot, step
@@ -139,10 +139,10 @@ def through_sphere(p, d, eta, kept_apart, key):
     cos_i = min(-dot(p, d), 1.0)
     polarisation = UNPOLARISED
     if kept_apart:
-        key = mix(key + np.uint64(0x9E3779B97F4A7C15))
+        key = mix(key + GOLDEN)
         polarisation = S if key & np.uint64(1) else P
     reflectance, cos_t = fresnel(cos_i, eta, polarisation)
-    key = mix(key + np.uint64(0x9E3779B97F4A7C15))
+    key = mix(key + GOLDEN)
     if unit(key) < reflectance:
         return p, step(d, 2.0 * cos_i, p), 0.0, key
     length = 0.0
@@ -152,7 +152,7 @@ def through_sphere(p, d, eta, kept_apart, key):
         size = 1.0 / math.sqrt(dot(p, p))
         p = (p[0] * size, p[1] * size, p[2] * size)
         length += 2.0 * cos_t
-        key = mix(key + np.uint64(0x9E3779B97F4A7C15))
+        key = mix(key + GOLDEN)
         if unit(key) >= reflectance:
             d = step((eta * d[0], eta * d[1], eta * d[2]), cos_i - eta * cos_t, p)
             return p, d, length, key
@@ -198,7 +198,7 @@ def at_facet(planes, centroids, facet, last, p, d, eta, state, key):
     ratio = 1.0 / eta if inside else eta
     cos_i = min(abs(cosine), 1.0)
     reflectance, cos_t = fresnel(cos_i, ratio, UNPOLARISED)
-    key = mix(key + np.uint64(0x9E3779B97F4A7C15))
+    key = mix(key + GOLDEN)
     if unit(key) < reflectance:
         d = step(d, -2.0 * cosine, n)
     else:
@@ -321,13 +321,10 @@ def packed(scene: Scene, place: Place, tables: Sequence[Table]) -> Packed:
             if grain.mesh_hash not in known:
                 known[grain.mesh_hash] = len(engines)
                 corners = grain.vertices[grain.faces]
-                normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-                normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-                middle = corners.mean(axis=1)
-                planes.append(np.column_stack((normals, np.einsum("ij,ij->i", normals, middle))))
-                centroids.append(middle)
+                planes.append(planes_of(corners))
+                centroids.append(corners.mean(axis=1))
                 first_facet.append(facets)
-                facets += len(middle)
+                facets += len(corners)
                 engines.append(embree_scene(grain))
             chosen.append(known[grain.mesh_hash])
     arrays = Grains(
@@ -426,9 +423,7 @@ class _Room:
             except GrainError:
                 continue  # open: it has no inside
             points = body.centre + body.bounding_radius * body.vertices
-            corners = points[body.faces]
-            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            self.closed.append((triangle_scene(points, body.faces), normals))
+            self.closed.append((triangle_scene(points, body.faces), planes_of(points[body.faces])[:, :3]))
 
     def near(self, point: np.ndarray, distance: float) -> bool:
         """Return whether anything may be nearer to a point (3,) than that."""

@@ -389,10 +389,14 @@ def _planes(meshes: Sequence[Triangles]) -> tuple[np.ndarray, np.ndarray]:
     if not meshes:
         return np.zeros((0, 4)), np.zeros(0)
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
+    return planes_of(corners), SLACK * np.abs(corners).max(axis=(1, 2))
+
+
+def planes_of(corners: np.ndarray) -> np.ndarray:
+    """Return normal and height over the origin (m, 4) of triangles given by their corners (m, 3, 3)."""
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    planes = np.column_stack((normals, np.einsum("ij,ij->i", normals, corners.mean(axis=1))))
-    return planes, SLACK * np.abs(corners).max(axis=(1, 2))
+    return np.column_stack((normals, np.einsum("ij,ij->i", normals, corners.mean(axis=1))))
 
 
 def _field(

@@ -8,6 +8,8 @@ import math
 import numpy as np
 from numba import njit
 
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: the step of SplitMix64
+
 # Direction numbers of the first four dimensions of Sobol' sequences (Joe & Kuo 2008: s, a, m)
 _JOE_KUO = ((0, 0, ()), (1, 0, (1,)), (2, 1, (1, 3)), (3, 1, (1, 3, 1)))
 
@@ -40,7 +42,7 @@ def mix(x):
 @njit(cache=True)
 def key_of(seed, a, b):
     """Return the random key of item (a, b) of a seed, uint64."""
-    k = mix(np.uint64(seed) + np.uint64(0x9E3779B97F4A7C15))
+    k = mix(np.uint64(seed) + GOLDEN)
     k = mix(k ^ (np.uint64(a) * np.uint64(0xD1342543DE82EF95)))
     return mix(k ^ (np.uint64(b) * np.uint64(0x2545F4914F6CDD1D) + np.uint64(1)))
 

@@ -24,7 +24,7 @@ from tsdf import tally as T
 from tsdf.grains import Grain, embree_scene
 from tsdf.horizon import UNKNOWN, horizon_of
 from tsdf.optics import UNPOLARISED, fresnel
-from tsdf.sampling import SOBOL, key_of, mix, sobol, turn, unit
+from tsdf.sampling import GOLDEN, SOBOL, key_of, mix, sobol, turn, unit
 from tsdf.tally import Tally
 from tsdf.vectors import cross, dot, frame, minus, step, triple
 
@@ -386,7 +386,7 @@ def advance(count, prims, sphere, planes, centroids, horizon, eta, polarisation,
             out, into = (bent, mirrored) if inside else (mirrored, bent)
             mirrored_weight = weight if total else rounded(weight * reflectance)
             out_weight = weight - mirrored_weight if inside else mirrored_weight
-            key = mix(key + np.uint64(0x9E3779B97F4A7C15))
+            key = mix(key + GOLDEN)
             lighter = min(out_weight, weight - out_weight)
             least = min(split, weight)
             free = dot(out, n) > low or low == 0.0

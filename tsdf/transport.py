@@ -22,7 +22,7 @@ from tsdf.geometry import MESH, NONE, ball_hit, clearance, exact_hit, facet_hit
 from tsdf.lights import draw as draw_light
 from tsdf.lights import radiance as light_from
 from tsdf.sampler import column_of, density, draw_column, draw_length, draw_offset, draw_record, leave, turned
-from tsdf.sampling import key_of, mix, unit
+from tsdf.sampling import GOLDEN, key_of, mix, unit
 from tsdf.vectors import KERNEL, cross, dot, frame, minus, step, triple
 
 TELEPORT, TELEPORT_JOINT, VOLUME, VOLUME_HG, ISOTROPIC, EXPLICIT = range(6)
@@ -51,7 +51,6 @@ UNKNOWN = -2  # medium of a walker that may have crossed a boundary
 EVENTS, RAYS, TRUNCATED, FAULTS = range(4)  # counters
 LIVE, ASKED, GRAINS_ASKED = range(3)  # what `advance` returns: walkers, rays to trace, then rays by exemplar
 
-GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 OTHER = np.uint64(0xA5A5A5A5A5A5A5A5)
 LOW = np.uint64(0xFFFFFFFF)
 HALF_WORD = 1.0 / 4294967296.0
