@@ -81,7 +81,7 @@ def main(
     before = signal.signal(signal.SIGTERM, stop)
     form = "{percentage:3.0f}% |{bar}| {postfix} [{elapsed}]"
     try:
-        with tqdm(total=1.0, disable=quiet, bar_format=form, dynamic_ncols=True) as bar:
+        with tqdm(total=1.0, disable=quiet or None, bar_format=form, dynamic_ncols=True) as bar:
 
             def progress(share: float, word: str) -> None:
                 bar.set_postfix_str(word, refresh=False)

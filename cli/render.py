@@ -52,6 +52,9 @@ def main(
     for name, value in (("--spp", spp), ("--width", width), ("--threads", threads)):
         if value is not None and value < 1:
             raise UsageError(f"{name} is a whole number of at least 1, not {value}")
+    for name, limit in (("--seconds", seconds), ("--target-error", target_error)):
+        if limit is not None and not 0.0 < limit < float("inf"):
+            raise UsageError(f"{name} is a finite number above 0, not {limit:g}")
     if seed is not None and not 0 <= seed < 2**63:
         raise UsageError(f"--seed is a whole number from 0 to 2^63 - 1, not {seed}")
     if sum(stop is not None for stop in (spp, seconds, target_error)) > 1:
@@ -77,7 +80,7 @@ def main(
     before = [signal.signal(number, lambda *_: stop.set()) for number in signals]
     form = "{percentage:3.0f}% |{bar}| {postfix} [{elapsed}<{remaining}]"
     try:
-        with tqdm(total=1.0, disable=quiet, bar_format=form, dynamic_ncols=True) as bar:
+        with tqdm(total=1.0, disable=quiet or None, bar_format=form, dynamic_ncols=True) as bar:
 
             def progress(share: float, word: str) -> None:
                 bar.set_postfix_str(word, refresh=False)

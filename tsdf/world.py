@@ -180,6 +180,12 @@ def build(scene: Scene, level: str) -> World:
                 f"{scene.name}: [[medium]] {number} ({medium.name}): a grain of diameter {2.0 * medium.radius:g} does "
                 f"not fit into the medium, which is {extent:.3g} thin"
             )
+    lights = _lights(scene)
+    if model == EXPLICIT and scene.media and lights.sampled:
+        notes.append(
+            f"{scene.name}: level explicit meets suns and small bright lights by chance alone: until many samples "
+            "have, the picture is too dark and its variance does not tell; widen the sun or light by a smooth sky"
+        )
     grains = packed(scene, made, tables) if model == EXPLICIT else nothing_packed(len(scene.media), len(tables))
     return World(
         scene=scene,
@@ -188,7 +194,7 @@ def build(scene: Scene, level: str) -> World:
         packed=grains,
         media=media,
         tables=compile_tables(tables or [_no_table()], joint=model == TELEPORT_JOINT),
-        lights=_lights(scene),
+        lights=lights,
         absorption=absorption,
         amounts=len(absorption.least),
         parameters=parameters,
