@@ -18,6 +18,7 @@ LAYERS = [
     {"errors"},
     {
         "files",
+        "container",
         "optics",
         "materials",
         "table",
@@ -44,11 +45,11 @@ LAYERS = [
 DOORS = {
     "trimesh": {"grains"},
     "embreex": {"grains"},
-    "OpenEXR": {"format", "image"},
+    "OpenEXR": {"container", "image"},
     "colour": {"image"},
     "PIL": {"image"},
     "matplotlib": {"plots"},
-    "jsonschema": {"format"},
+    "jsonschema": {"container"},
 }
 
 
