@@ -138,6 +138,14 @@ class Bar:
     "--joint", callback=_count, default="0", metavar="K", show_default=True, help="Joint records per cell of theta."
 )
 @click.option(
+    "--memory",
+    callback=_count,
+    default="0",
+    metavar="K",
+    show_default=True,
+    help="Records per cell of entry, which level teleport-memory draws from.",
+)
+@click.option(
     "--seed", callback=_count, default="0", metavar="N", show_default=True, help="Seed of the random numbers."
 )
 @click.option(
@@ -176,6 +184,7 @@ def main(
     target_error: float | None,
     cells: int | None,
     joint: int,
+    memory: int,
     seed: int,
     max_bounces: int,
     threads: int | None,
@@ -213,7 +222,7 @@ def main(
         optics = Optics(found.n, fresnel, found.material, found.wavelength_nm, found.k, found.source)
     else:
         optics = Optics(eta, fresnel)
-    effort = scatterometer.Effort(paths, target_error, cells, joint, seed, max_bounces)
+    effort = scatterometer.Effort(paths, target_error, cells, joint, seed, max_bounces, memory)
     check_output(out, Path(grain))
     part_file = out if part is not None else out.with_name(out.name + ".part")
     if not exact and part_file.exists() and not resume:

@@ -92,6 +92,7 @@ def describe(table: "Table", absorption: float = 0.0) -> dict[str, Any]:
         "energy_ledger": header["energy_ledger"],
         "cells": {"cos_theta": len(table.p_theta) - 2} | {n: len(table.block(n)) for n in CONDITIONALS},
         "joint_records": len(table.joint["r"]) if table.joint else 0,
+        "memory_records": len(table.memory["r"]) if table.memory else 0,
         "pixels_sha256": header["pixels_sha256"],
         "licence": header["licence"],
     }
@@ -195,7 +196,7 @@ def _lines(facts: Mapping[str, Any]) -> Iterator[str]:
         yield row(name, share)
     yield "table"
     cells = ", ".join(f"{key} {value}" for key, value in facts["cells"].items())
-    yield row("cells", f"{cells}; joint records {facts['joint_records']}")
+    yield row("cells", f"{cells}; joint records {facts['joint_records']}; records by entry {facts['memory_records']}")
     paths = f"{facts['paths']} paths, seed {facts['seed']}" if facts["paths"] else "no random numbers"
     yield row("made by", f"{facts['software']}, {facts['method']}, {paths}")
     yield row("command", facts["command"])

@@ -45,6 +45,22 @@ def records(column: int, count: int, atom: bool) -> list[dict[str, float]]:
     return made
 
 
+def records_by_entry(column: int, columns: int, count: int) -> list[dict[str, float]]:
+    """Return made-up records of light that enters in one cell of entry_b2."""
+    made = []
+    for k, record in enumerate(records(column, count, False)):
+        b2 = (column + (2 * k + 1) / (2 * count)) / columns
+        entry, azimuth = (math.sqrt(b2), 0.0, -math.sqrt(1.0 - b2)), record["entry_azimuth"]
+        u, v = ((5 * k + 3 * column) % 8 - 4) / 8, ((3 * k + 2 * column) % 8 - 3) / 4
+        scale = 1.0 + u * u + v * v
+        offset = (2 * u / scale - entry[0], 2 * v / scale - entry[1], (2.0 - scale) / scale - entry[2])
+        phi_delta = math.remainder(math.atan2(offset[1], offset[0]) - azimuth, 2 * math.pi)
+        fields = {"cos_theta": ((5 * k + column) % 9 - 4) / 4, "entry_azimuth": azimuth}
+        fields |= {"r": math.hypot(offset[0], offset[1]), "z": offset[2], "phi_delta": phi_delta, "l": record["l"]}
+        made.append({key: float(np.float32(value)) for key, value in {**fields, "entry_b2": b2}.items()})
+    return made
+
+
 def shares(values: list[float], edges: list[float]) -> list[float]:
     """Return the share of the values in each cell; the last takes all that is above, an atom what is 0."""
     made = [0.0] * (len(edges) - 1)
@@ -60,9 +76,12 @@ def cell(value: float, edges: list[float]) -> int:
 
 
 def table(
-    weights: list[int], phi: int = 2, other: int = 2, count: int = 4, joint: bool = False
+    weights: list[int], phi: int = 2, other: int = 2, count: int = 4, joint: bool = False, memory: int = 0
 ) -> tuple[Header, np.ndarray]:
-    """Return header and pixels of a made-up table; `weights` are the masses of its columns."""
+    """Return header and pixels of a made-up table; `weights` are the masses of its columns.
+
+    With `memory` records by entry in each column, of which the last but one is never hit.
+    """
     inner = len(weights) - 2
     cos_edges = [-1.0, *(-1.0 + 2.0 * i / inner for i in range(inner + 1)), 1.0]
     edges = {
@@ -72,6 +91,7 @@ def table(
         "l": [0.0, *(1.0 * i / other for i in range(other + 1))],
     }
     units = {"phi_delta": "rad", "r": "R", "z": "R", "l": "R", "entry_b2": "R^2", "entry_azimuth": "rad"}
+    units_by_entry = {**units, "cos_theta": "1"}
     rows: dict[str, list[list[float]]] = {}
     p_theta = [weight / sum(weights) for weight in weights]
     drawn = [records(c, count, c in (0, inner + 1)) for c in range(inner + 2)]
@@ -88,10 +108,18 @@ def table(
         rows.setdefault("mean_l", []).append([sum(values) / max(len(values), 1) for values in cells])
         for field in units if joint else ():
             rows.setdefault(f"joint_{field}", []).append([record[field] for record in column])
+    for c in range(len(weights)) if memory else ():
+        hit = 0.0 if c == inner else 1.0 - 0.125 * (c % 4)
+        rows.setdefault("memory_hit", []).append([hit])
+        by_entry = records_by_entry(c, len(weights), memory)
+        for field in units_by_entry:
+            rows.setdefault(f"memory_{field}", []).append([record[field] * (hit > 0.0) for record in by_entry])
     blocks: list[Header] = []
     pixels: list[np.ndarray] = []
     for name in sorted(rows, key=BLOCK_ORDER.index):
-        block = np.array(rows[name], dtype=np.float64).T * (np.array(weights) > 0) + 0.0
+        block = np.array(rows[name], dtype=np.float64).T + 0.0
+        if not name.startswith("memory_"):
+            block = block * (np.array(weights) > 0) + 0.0
         entry: Header = {
             "name": name,
             "kind": "mass",
@@ -101,8 +129,10 @@ def table(
         field = name.removeprefix("joint_").removeprefix("p_").replace("phi_delta", "phi").replace("phi", "phi_delta")
         if name == "mean_l":
             entry |= {"kind": "mean", "of": "p_l", "unit": "R"}
-        elif name.startswith("joint_"):
-            entry |= {"kind": "record", "unit": units[field]}
+        elif name == "memory_hit":
+            entry["kind"] = "probability"
+        elif name.startswith(("joint_", "memory_")):
+            entry |= {"kind": "record", "unit": units_by_entry[name.removeprefix("joint_").removeprefix("memory_")]}
         elif name != "p_theta":
             entry |= {"quantity": field, "unit": units[field], "edges": edges[field]}
         blocks.append(entry)
@@ -129,7 +159,7 @@ def table(
     pairs = ("r_z", "r_phi", "z_phi", "r_l", "z_l", "phi_l")
     header: Header = {
         "format": "tsdf",
-        "format_version": "1.0",
+        "format_version": "1.1" if memory else "1.0",
         "required_features": [],
         "columns": {"quantity": "cos_theta", "edges": cos_edges},
         "blocks": blocks,
@@ -187,6 +217,7 @@ def table(
 
 BLOCK_ORDER = ["p_theta", "p_phi", "p_r", "p_z", "p_l", "mean_l"]
 BLOCK_ORDER += [f"joint_{f}" for f in ("r", "z", "phi_delta", "l", "entry_b2", "entry_azimuth")]
+BLOCK_ORDER += [f"memory_{f}" for f in ("hit", "cos_theta", "entry_azimuth", "r", "z", "phi_delta", "l", "entry_b2")]
 
 
 # --- bytes -------------------------------------------------------------------------
@@ -270,8 +301,8 @@ def valid() -> dict[str, bytes]:
     extended["blocks"][1]["x_display"] = "polar"
 
     newer, newer_pixels = table(WEIGHTS)
-    newer["format_version"] = "1.1"
-    newer["polarisation"] = "unknown to 1.0"
+    newer["format_version"] = "1.2"
+    newer["polarisation"] = "unknown to 1.1"
     newer["blocks"].append({"name": "p_spin", "kind": "spin", "first_row": len(newer_pixels), "rows": 2})
     newer_pixels = np.concatenate([newer_pixels, np.full((2, 4), -0.25, dtype="<f4")])
 
@@ -279,6 +310,8 @@ def valid() -> dict[str, bytes]:
         "minimal": file(*table(WEIGHTS)),
         "records": file(*table([1, 1, 2, 4, 6, 2], count=8, joint=True)),
         "empty_columns": file(*table([0, 4, 0, 8, 4, 0], count=4, joint=True)),
+        "memory": file(*table([1, 1, 2, 4, 6, 2], count=8, joint=True, memory=4)),
+        "memory_alone": file(*table([0, 4, 0, 8, 4, 0], memory=3)),
         "extensions": file(extended, pixels),
         "newer_minor": file(newer, newer_pixels),
         "many_rows": file(*table([1, 1, 2, 4, 6, 2], phi=16, other=12, count=16, joint=True)),
@@ -293,6 +326,7 @@ def invalid() -> dict[str, bytes]:
     """Return the invalid files by name, CODE or CODE-variant: each breaks the rule of that code first."""
     plain, plain_pixels = table(WEIGHTS)
     joint, joint_pixels = table([1, 1, 2, 4, 6, 2], count=8, joint=True)
+    memory, memory_pixels = table([1, 1, 2, 4, 6, 2], count=8, joint=True, memory=4)
     good = file(plain, plain_pixels)
     made: dict[str, bytes] = {}
 
@@ -406,6 +440,9 @@ def invalid() -> dict[str, bytes]:
     edit("HEADER_SCHEMA-quantity", at("quantity", "theta", "columns"))
     edit("HEADER_SCHEMA-unit", at("unit", "deg", "blocks", 1))
     edit("HEADER_SCHEMA-negative_row", at("first_row", -1, "blocks", 0))
+    edit("HEADER_SCHEMA-memory_rows", at("rows", 2, "blocks", 12), memory, memory_pixels)
+    edit("HEADER_SCHEMA-memory_unit", at("unit", "R", "blocks", -1), memory, memory_pixels)
+    edit("HEADER_SCHEMA-not_in_1_1", at("polarisation", "unknown to 1.1"), memory, memory_pixels)
     edit("HEADER_SCHEMA-many", at("optics", {"eta": -1, "fresnel": "s"}))
     edit("HEADER_LEDGER", at("lost", 1, "energy_ledger"))
     edit("MANIFEST_ROWS-overlap", at("first_row", 2, "blocks", 2))
@@ -422,7 +459,13 @@ def invalid() -> dict[str, bytes]:
     )
     spin = {"name": "p_spin", "kind": "spin", "first_row": height, "rows": 1}
     taller = np.concatenate([plain_pixels, plain_pixels[-1:]])
+
+    def new_spin(header: Header) -> None:
+        header["blocks"].append({**spin, "first_row": len(memory_pixels)})
+
     edit("MANIFEST_UNKNOWN", lambda header: header["blocks"].append(spin), plain, taller)
+    edit("MANIFEST_UNKNOWN-memory_in_1_0", at("format_version", "1.0"), memory, memory_pixels)
+    edit("MANIFEST_UNKNOWN-not_in_1_1", new_spin, memory, np.concatenate([memory_pixels, memory_pixels[-1:]]))
     edit("MANIFEST_MISSING", lambda header: header["blocks"].pop(), plain, plain_pixels[:-3])
     edit("MANIFEST_MEAN", at("rows", 2, "blocks", -1), plain, plain_pixels[:-1])
 
@@ -431,6 +474,20 @@ def invalid() -> dict[str, bytes]:
         header["blocks"][2:4] = [{**z, "first_row": r["first_row"]}, {**r, "first_row": z["first_row"]}]
 
     edit("MANIFEST_ORDER", swap)
+
+    def swap_memory(header: Header) -> None:
+        r, z = header["blocks"][15:17]
+        header["blocks"][15:17] = [{**z, "first_row": r["first_row"]}, {**r, "first_row": z["first_row"]}]
+
+    def no_hit(header: Header) -> None:
+        del header["blocks"][12]
+        for block in header["blocks"][12:]:
+            block["first_row"] -= 1
+
+    edit("MANIFEST_ORDER-memory", swap_memory, memory, memory_pixels)
+    edit("MANIFEST_MEMORY-six", lambda header: header["blocks"].pop(), memory, memory_pixels[:-4])
+    edit("MANIFEST_MEMORY-length", at("rows", 3, "blocks", -1), memory, memory_pixels[:-1])
+    edit("MANIFEST_MEMORY-no_hit", no_hit, memory, np.delete(memory_pixels, memory["blocks"][12]["first_row"], axis=0))
     edit("MANIFEST_RECORDS-five", lambda header: header["blocks"].pop(), joint, joint_pixels[:-8])
     edit("MANIFEST_RECORDS-length", at("rows", 7, "blocks", -1), joint, joint_pixels[:-1])
     edit("MANIFEST_EDGE_COUNT", at("edges", [0.0, 2.0], "blocks", 2))
@@ -462,6 +519,23 @@ def invalid() -> dict[str, bytes]:
     flipped = joint_pixels.copy()
     flipped[joint["blocks"][11]["first_row"] :] *= -1.0
     made["VALUE_RECORD_SPHERE-azimuth_sign"] = file(joint, flipped)
+
+    def by_entry(name: str, block: str, row: int, column: int, value: float) -> None:
+        first = next(each["first_row"] for each in memory["blocks"] if each["name"] == f"memory_{block}")
+        changed = memory_pixels.copy()
+        changed[first + row, column] = value
+        made[name] = file(memory, changed)
+
+    by_entry("VALUE_NOT_FINITE-memory", "l", 3, 5, math.nan)
+    by_entry("VALUE_MEMORY_HIT", "hit", 0, 1, 1.5)
+    by_entry("VALUE_MEMORY_HIT-negative", "hit", 0, 2, -0.5)
+    by_entry("VALUE_RECORD_RANGE-cos_theta", "cos_theta", 1, 3, -1.25)
+    by_entry("VALUE_RECORD_ORDER-memory", "entry_b2", 2, 2, 0.34375)
+    by_entry("VALUE_RECORD_SPHERE-memory", "phi_delta", 2, 2, 0.3125)
+    strayed, first = memory_pixels.copy(), memory["blocks"][13]["first_row"]
+    strayed[first:, 2:4] = strayed[first:, 3:1:-1].copy()
+    made["VALUE_MEMORY_CELL"] = file(memory, strayed)
+    by_entry("VALUE_MEMORY_EMPTY", "l", 0, 4, 0.5)
     return made
 
 

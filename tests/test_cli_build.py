@@ -40,7 +40,19 @@ def test_sphere(tmp_path: Path) -> None:
 
 def test_the_recorded_command_makes_the_same_bytes(tmp_path: Path) -> None:
     first, second = tmp_path / "1.exr", tmp_path / "2.exr"
-    words = ["hexprism", "--set", "aspect=0.5", "--material", "ice", "--wavelength-nm", "600", "--joint", "3"]
+    words = [
+        "hexprism",
+        "--set",
+        "aspect=0.5",
+        "--material",
+        "ice",
+        "--wavelength-nm",
+        "600",
+        "--joint",
+        "3",
+        "--memory",
+        "2",
+    ]
     assert run(*words, "--paths", "12000", "--quiet", "--out", first).exit_code == 0
     command = tsdf.read(first).header["provenance"]["command"].split()
     assert command[0] == "tsdf-build"
@@ -113,6 +125,8 @@ def test_interrupt_says_what_is_safe(number: int, tmp_path: Path) -> None:
         (["cube", "--paths", "1e30"], 2, "paths"),
         (["cube", "--paths", "1.5"], 2, "whole number"),
         (["cube", "--paths", "many"], 2, "whole number"),
+        (["cube", "--memory", "-1"], 2, "cell of entry"),
+        (["cube", "--memory", "some"], 2, "whole number"),
         (["cube", "--chunk", "3/2"], 2, "--chunk"),
         (["cube", "--chunk", "1/2", "--target-error", "0.1"], 2, "--paths"),
         (["cube", "--eta", "1.3", "--material", "ice"], 2, "not both"),

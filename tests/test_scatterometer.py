@@ -45,21 +45,21 @@ def octahedron() -> Grain:
 def reference(octahedron: Grain, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The file of a build in one piece on one thread; the other ways must give its very bytes."""
     path = tmp_path_factory.mktemp("reference") / "one.tsdf.exr"
-    tsdf.write(built(octahedron, Optics(1.31), threads=1, paths=30_000, joint=4), path)
+    tsdf.write(built(octahedron, Optics(1.31), threads=1, paths=30_000, joint=4, memory=3), path)
     return path.read_bytes()
 
 
 @pytest.mark.parametrize("threads", [2, 7])
 def test_threads_do_not_show(octahedron: Grain, reference: bytes, threads: int, tmp_path: Path) -> None:
     path = tmp_path / "t.tsdf.exr"
-    tsdf.write(built(octahedron, Optics(1.31), threads=threads, paths=30_000, joint=4), path)
+    tsdf.write(built(octahedron, Optics(1.31), threads=threads, paths=30_000, joint=4, memory=3), path)
     assert path.read_bytes() == reference
 
 
 def test_parts_merge_to_the_whole_in_any_order(octahedron: Grain, reference: bytes, tmp_path: Path) -> None:
     parts = []
     for i in (1, 2, 3):
-        build = Build.start(octahedron, Optics(1.31), Effort(paths=30_000, joint=4))
+        build = Build.start(octahedron, Optics(1.31), Effort(paths=30_000, joint=4, memory=3))
         parts.append(tmp_path / f"{i}.part")
         build.run(octahedron, 1, (i, 3), parts[-1])
     for order in (parts, parts[::-1]):
@@ -69,6 +69,49 @@ def test_parts_merge_to_the_whole_in_any_order(octahedron: Grain, reference: byt
         merge(parts[:2]).table()
     with pytest.raises(TSDFError, match="give each part once"):
         merge([*parts, parts[0]])
+
+
+def test_a_table_without_records_by_entry_is_as_ever(octahedron: Grain) -> None:
+    """Version 1.0 and the same pixels; the records by entry stand below them, each in the cell of its column."""
+    optics = Optics(1.31)
+    having, without = (built(octahedron, optics, paths=30_000, joint=4, memory=m, cells=32) for m in (3, 0))
+    assert (having.header["format_version"], without.header["format_version"]) == ("1.1", "1.0")
+    assert np.array_equal(having.pixels[: len(without.pixels)], without.pixels)
+    assert not without.memory and having.memory["r"].shape == (3, 34) and having.hit.shape == (34,)
+    cell = (having.memory["entry_b2"][:, having.hit > 0.0] * 34.0).astype(int)
+    assert np.array_equal(cell, np.broadcast_to(np.flatnonzero(having.hit > 0.0), cell.shape))
+    assert having.hit.mean() == pytest.approx(having.statistics["hit_probability"], abs=1e-3)
+    with pytest.raises(UsageError, match="no block 'memory_hit'"):
+        _ = without.hit
+
+
+def test_few_paths_leave_no_record_without_light(octahedron: Grain) -> None:
+    """So few paths that some cells of entry are hit by none: their records are 0, all others are of their cell."""
+    table = built(octahedron, Optics(1.31), paths=1024, memory=2, cells=512)
+    hit, memory = table.hit, table.memory
+    assert 10 < np.count_nonzero(hit == 0.0) < 400
+    for values in memory.values():
+        assert not values[:, hit == 0.0].any()
+    b2 = memory["entry_b2"][:, hit > 0.0] * 514.0 - np.flatnonzero(hit > 0.0)
+    assert b2.min() > -1e-3 and b2.max() < 1.0 + 1e-3
+
+
+@pytest.mark.parametrize(("eta", "fresnel"), [(1.33, "un"), (1.5, "sp"), (0.75, "un"), (1.0, "un")])
+def test_records_by_entry_of_the_exact_sphere(eta: float, fresnel: str) -> None:
+    """They have the statistics of the sphere, by quadrature: 32 x 258 of them are within 2e-3.
+
+    Fewer records are less even, but not biased: where they begin varies from cell to cell.
+    """
+    truth = analytic.sphere_statistics(eta, fresnel)
+    for count, allowed in ((32, 2e-3), (3, 1e-2)):
+        table = scatterometer.exact_sphere(load_grain("sphere"), Optics(eta, fresnel), Effort(memory=count))
+        memory = table.memory
+        assert np.all(table.hit == 1.0) and memory["r"].shape == (count, 258)
+        assert memory["cos_theta"].mean(dtype=float) == pytest.approx(truth.mean_cosine, abs=allowed)
+        assert memory["z"].mean(dtype=float) == pytest.approx(truth.mean_z, abs=2.0 * allowed)
+        assert memory["r"].mean(dtype=float) == pytest.approx(truth.mean_r, abs=2.0 * allowed)
+        assert memory["l"].mean(dtype=float) == pytest.approx(truth.mean_path_length, abs=4.0 * allowed)
+        assert memory["entry_b2"].mean(dtype=float) == pytest.approx(0.5, abs=1e-3)
 
 
 def test_part_of_another_build_is_refused(octahedron: Grain, tmp_path: Path) -> None:
@@ -89,7 +132,7 @@ def test_resuming_gives_the_same_bytes(octahedron: Grain, reference: bytes, tmp_
         if progress.paths >= 2 * scatterometer.CHUNK_MIN:
             raise Stop
 
-    build = Build.start(octahedron, Optics(1.31), Effort(paths=30_000, joint=4))
+    build = Build.start(octahedron, Optics(1.31), Effort(paths=30_000, joint=4, memory=3))
     with pytest.raises(Stop):
         build.run(octahedron, 2, part_file=part, report=stop)
     resumed = Build.load(part)
@@ -230,6 +273,8 @@ def test_stated_errors_are_those_of_repeated_builds() -> None:
         ({"paths": 5000, "target_error": 0.1}, "not both"),
         ({"cells": 4}, "cells of theta"),
         ({"joint": -1}, "joint records"),
+        ({"memory": -1}, "cell of entry"),
+        ({"memory": 1025}, "cell of entry"),
         ({"seed": -1}, "seed"),
         ({"max_bounces": 0}, "bounce limit"),
     ],

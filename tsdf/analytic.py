@@ -716,6 +716,39 @@ def sphere_events(eta: float, fresnel: str = "un", intervals: int = 65536) -> Sp
     return SphereEvents(weight, start, stop, r, z, phi, length, b2, azimuth, order, float(residual))
 
 
+def sphere_direction(entry_b2: ArrayLike, order: ArrayLike, eta: float) -> tuple[Array, Array]:
+    """Direction in which light leaves the sphere, in its plane of incidence.
+
+    Parameters
+    ----------
+    entry_b2 : (n,) array_like of float64
+        Impact parameter squared, in [0, 1] [R^2].
+    order : (n,) array_like of float64
+        Number of chords; no meaning where light with entry_b2 > eta^2 is said to have one.
+    eta : float
+        Relative refractive index, > 0 [1].
+
+    Returns
+    -------
+    along, aside : (n,) ndarray of float64
+        Parts along d_in, which is cos_theta, and across it towards the side of the entry point [1].
+
+    Raises
+    ------
+    UsageError
+        An argument is out of its domain.
+    """
+    b2, _ = _array("entry_b2", entry_b2, 0.0, 1.0)
+    p, _ = _array("order", order, 0.0, np.inf)
+    _check(eta, "un", 0.0)
+    b = np.sqrt(b2)
+    # arctan2 keeps the digits at grazing that arcsin loses
+    ti, tt = np.arctan2(b, np.sqrt(1 - b2)), np.arctan2(b, np.sqrt(np.maximum(eta * eta - b2, 0.0)))
+    turn = 2 * (p * tt - ti)
+    flip = np.where(p % 2 == 1, 1.0, -1.0)
+    return flip * np.cos(turn), flip * np.sin(turn)
+
+
 # --- Fresnel and theorems -----------------------------------------------------------------------------------
 
 

@@ -17,7 +17,7 @@ from tsdf import analytic
 from tsdf import tally as T
 from tsdf.errors import TSDFError
 from tsdf.optics import Optics
-from tsdf.table import CONDITIONALS, FORMAT_VERSION, RECORD_FIELDS, Table
+from tsdf.table import CONDITIONALS, MEMORY_FIELDS, RECORD_FIELDS, Table, version_for
 from tsdf.tally import Tally
 
 LEGENDRE = 16  # highest Legendre moment in the header
@@ -367,6 +367,65 @@ def records_of(tally: Tally, cells: int) -> np.ndarray:
     return result
 
 
+@dataclass(frozen=True)
+class Memory:
+    """The response of a grain given its entry obliquity.
+
+    Parameters
+    ----------
+    hit : (columns,) float64
+        Share of the rays of each cell of entry_b2 that meet the grain.
+    records : (fields, K, columns) float64
+        Equally likely records of the light that met it, `MEMORY_FIELDS`, by ascending entry_b2; 0 where hit is.
+    """
+
+    hit: np.ndarray
+    records: np.ndarray
+
+
+def memory_of(tally: Tally, columns: int, count: int) -> Memory:
+    """Return `count` records for each of so many equal cells of entry_b2.
+
+    The cells do not end where the reservoirs do. Of the reservoirs that a cell touches, the least of the largest keys is
+    a threshold that does not change with the key of any record below it. So the records below it are a priority sample
+    of all that light and of any part of it: each stands for its weight, or for the inverse threshold if that is more,
+    and `count` are drawn in proportion to that.
+    """
+    b2 = 2 + MEMORY_FIELDS.index("entry_b2")
+    rays, met = _in_equal_cells(np.stack((tally.entry[0], tally.entry[0] - tally.entry[1])), columns)
+    hit = np.minimum(ratio(met, rays), 1.0)
+    thresholds = tally.entry_records[:, :, 0].max(axis=1)
+    records = np.zeros((len(MEMORY_FIELDS), count, columns))
+    for column in range(columns):
+        low, high = column / columns, (column + 1) / columns
+        touched = slice(int(low * T.COARSE), math.ceil(high * T.COARSE))
+        threshold = thresholds[touched].min()
+        rows = tally.entry_records[touched].reshape(-1, T.MEMORY)
+        inside = (rows[:, b2] >= low) & ((rows[:, b2] < high) | (column == columns - 1))
+        rows = rows[inside & (rows[:, 0] < threshold)]
+        if len(rows) == 0 or not (hit[column] > 0.0):
+            hit[column] = 0.0
+            continue
+        rows = rows[np.lexsort((*rows.T[::-1], rows[:, b2]))]  # by entry_b2, and by the rest where that is equal
+        weights = np.maximum(rows[:, 1], 1.0 / threshold)
+        records[:, :, column] = rows[systematic(weights, count), 2:].T
+    for name in ("entry_azimuth", "phi_delta"):
+        angles = records[MEMORY_FIELDS.index(name)]
+        angles[angles <= -math.pi] = math.pi
+    return Memory(hit, records)
+
+
+def _in_equal_cells(counts: np.ndarray, columns: int) -> np.ndarray:
+    """Sum (..., n) counts by equal cells of [0, 1] into `columns` of them; what lies across a limit is divided."""
+    running = np.zeros((*counts.shape[:-1], counts.shape[-1] + 1))
+    np.cumsum(counts, axis=-1, out=running[..., 1:])
+    places = np.arange(columns + 1) * counts.shape[-1] / columns
+    before = places.astype(int)
+    after = np.minimum(before + 1, counts.shape[-1])
+    sums = running[..., before] + (places - before) * (running[..., after] - running[..., before])
+    return np.diff(sums, axis=-1)
+
+
 def normalised(energy: np.ndarray) -> np.ndarray:
     """Return (rows, columns) masses that sum to 1 in each column that holds anything, from (columns, rows) energy."""
     energy = energy.T.astype(np.float64)
@@ -390,6 +449,7 @@ def assemble(
     conditionals: Mapping[str, np.ndarray],
     mean_l: np.ndarray,
     joint: np.ndarray | None,
+    memory: Memory | None,
     statistics: dict[str, Any],
     standard_errors: dict[str, Any],
     error: TableError,
@@ -418,14 +478,18 @@ def assemble(
         entry = {"name": name, "kind": "mass", "quantity": quantity, "unit": unit, "edges": axis.tolist()}
         stack(entry, conditionals[name])
     stack({"name": "mean_l", "kind": "mean", "of": "p_l", "unit": "R"}, mean_l)
+    units = {"phi_delta": "rad", "entry_azimuth": "rad", "entry_b2": "R^2", "cos_theta": "1"}
     if joint is not None:
-        units = {"phi_delta": "rad", "entry_azimuth": "rad", "entry_b2": "R^2"}
         for name, values in zip(RECORD_FIELDS, joint, strict=True):
             stack({"name": f"joint_{name}", "kind": "record", "unit": units.get(name, "R")}, values)
+    if memory is not None:
+        stack({"name": "memory_hit", "kind": "probability"}, memory.hit[None, :])
+        for name, values in zip(MEMORY_FIELDS, memory.records, strict=True):
+            stack({"name": f"memory_{name}", "kind": "record", "unit": units.get(name, "R")}, values)
     pixels = np.concatenate(rows).astype(np.float32)
     header = {
         "format": "tsdf",
-        "format_version": FORMAT_VERSION,
+        "format_version": version_for(block["name"] for block in blocks),
         "required_features": [],
         "columns": {"quantity": "cos_theta", "edges": edges.tolist()},
         "blocks": blocks,
@@ -451,9 +515,14 @@ def assemble(
 
 
 def traced_table(
-    tally: Tally, cells: int, grain: Mapping[str, Any], optics: Optics, provenance: Mapping[str, Any]
+    tally: Tally,
+    cells: int,
+    grain: Mapping[str, Any],
+    optics: Optics,
+    provenance: Mapping[str, Any],
+    memory: int = 0,
 ) -> Table:
-    """Return the table that a tally of traced paths stands for.
+    """Return the table that a tally of traced paths stands for, with `memory` records by entry in each column.
 
     Raises
     ------
@@ -491,6 +560,7 @@ def traced_table(
         conditionals={f"p_{name}": normalised(columns[name]) for name in ("phi", "r", "z", "l")},
         mean_l=ratio(columns["l_sum"].astype(np.float64), columns["l"].astype(np.float64)).T,
         joint=records_of(tally, cells) if tally.joint else None,
+        memory=memory_of(tally, cells + 2, memory) if memory else None,
         statistics=statistics,
         standard_errors=standard_errors,
         error=table_error(tally, cells),

@@ -19,6 +19,7 @@ from tsdf.estimate import (
     MAX_CELLS,
     STATISTICS,
     Factorisation,
+    Memory,
     TableError,
     assemble,
     candidate_cells,
@@ -28,7 +29,7 @@ from tsdf.estimate import (
     systematic,
 )
 from tsdf.optics import Optics
-from tsdf.table import RECORD_FIELDS, Table
+from tsdf.table import MEMORY_FIELDS, RECORD_FIELDS, Table
 
 LEDGER_UNITS = 1 << 52  # energy units of an exact table
 
@@ -80,6 +81,28 @@ def _choose(weight, low, high, edges, totals, chosen):  # type: ignore[no-untype
             chosen[i, j] = chosen[i, taken[i] - 1] if taken[i] > 0 else 0
 
 
+def _memory(events: analytic.SphereEvents, eta: float, columns: int, count: int) -> Memory:
+    """Return `count` records for each of so many equal cells of entry_b2, evenly spaced in the running sum of weights.
+
+    The sum runs through the orders one after the other, so that the records of a cell hold each with its share of the
+    light and spread over the cell.
+    """
+    along, _ = analytic.sphere_direction(events.entry_b2, events.order, eta)
+    by_name = {"cos_theta": along, "l": events.path_length}
+    fields = np.stack([by_name[name] if name in by_name else getattr(events, name) for name in MEMORY_FIELDS])
+    column = np.minimum((events.entry_b2 * columns).astype(np.int64), columns - 1)
+    order = np.lexsort((events.entry_b2, events.order, column))
+    limits = np.searchsorted(column[order], np.arange(columns + 1))
+    records = np.zeros((len(MEMORY_FIELDS), count, columns))
+    for c in range(columns):
+        members = order[limits[c] : limits[c + 1]]
+        running = np.cumsum(events.weight[members])
+        places = (np.arange(count) + c * SHIFT % 1.0) / count * running[-1]
+        chosen = members[np.minimum(np.searchsorted(running, places, side="right"), len(members) - 1)]
+        records[:, :, c] = fields[:, chosen[np.argsort(events.entry_b2[chosen], kind="stable")]]
+    return Memory(np.ones(columns), records)
+
+
 def _exact_width(optics: Optics, cells: int) -> float:
     """Return the total variation between the exact p_theta and its cell means."""
     parts = 16
@@ -100,6 +123,7 @@ def exact_table(
     grain: Mapping[str, Any],
     optics: Optics,
     provenance: Mapping[str, Any],
+    memory: int = 0,
 ) -> Table:
     """Return the table of the exact sphere by quadrature over the impact parameter, without random numbers.
 
@@ -111,6 +135,8 @@ def exact_table(
         Total variation of p_theta that the cells may cost.
     joint : int
         Records per column, 0 for none.
+    memory : int
+        Records per column by entry, 0 for none.
     """
     if cells is None:
         assert target is not None
@@ -219,6 +245,7 @@ def exact_table(
         conditionals=conditionals,
         mean_l=mean_l,
         joint=records,
+        memory=_memory(events, optics.eta, cells + 2, memory) if memory else None,
         statistics=statistics,
         standard_errors=dict.fromkeys(STATISTICS, 0.0) | {"legendre_moments": [0.0] * (LEGENDRE + 1)},
         error=TableError(cells, 0.0, 0.0 if atoms else _exact_width(optics, cells)),

@@ -6,7 +6,7 @@ table is stands in `table`; whether its numbers are plausible physics, in `valid
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 from tsdf import container
 from tsdf.container import Broken, Format
 from tsdf.errors import Finding, TSDFError
-from tsdf.table import CONDITIONALS, FORMAT_VERSION, RECORD_FIELDS, Table, thawed
+from tsdf.table import CONDITIONALS, FORMAT_VERSION, MEMORY_FIELDS, RECORD_FIELDS, Table, thawed, version_for
 
 # code: (severity, rule). The set is closed; SPEC.md lists it and `reference_data/golden` breaks each of them.
 CODES = container.rules("tsdf", "tsdf", "header.schema.json") | {
@@ -24,13 +24,17 @@ CODES = container.rules("tsdf", "tsdf", "header.schema.json") | {
     "MANIFEST_HEIGHT": ("error", "the rows of all blocks are as many as the image has"),
     "MANIFEST_WIDTH": ("error", "the image has as many columns as there are cells of cos theta"),
     "MANIFEST_DUPLICATE": ("error", "no block occurs twice"),
-    "MANIFEST_UNKNOWN": ("error", "a file of version 1.0 has only the blocks of version 1.0"),
+    "MANIFEST_UNKNOWN": ("error", "a file of version 1.0 or 1.1 has only the blocks of its version"),
     "MANIFEST_MISSING": ("error", "p_theta, p_phi, p_r, p_z, p_l and mean_l are present"),
     "MANIFEST_ORDER": ("error", "the blocks stand in the order of the specification"),
     "MANIFEST_MEAN": ("error", "mean_l has as many rows as p_l"),
     "MANIFEST_RECORDS": (
         "error",
         "the six joint blocks are all present with the same number of rows, or all absent",
+    ),
+    "MANIFEST_MEMORY": (
+        "error",
+        "memory_hit and seven memory blocks with the same number of rows are all present, or all absent",
     ),
     "MANIFEST_EDGE_COUNT": ("error", "a block of masses has one edge more than rows"),
     "MANIFEST_EDGE_ORDER": ("error", "edges ascend; exactly the cells that are atoms have zero width"),
@@ -44,17 +48,26 @@ CODES = container.rules("tsdf", "tsdf", "header.schema.json") | {
     ),
     "VALUE_EMPTY_COLUMN": ("error", "a column of which p_theta is 0 is 0 throughout"),
     "VALUE_MEAN_RANGE": ("error", "mean_l lies in its cell of p_l, and is 0 where the mass is 0"),
-    "VALUE_RECORD_RANGE": ("error", "records lie in their ranges; entry_azimuth is 0 in the atoms"),
+    "VALUE_RECORD_RANGE": ("error", "records lie in their ranges; entry_azimuth is 0 in the atoms of joint records"),
     "VALUE_RECORD_ORDER": ("error", "the records of a column ascend in entry_b2"),
     "VALUE_RECORD_SPHERE": ("error", "entry and exit of every record lie on the bounding sphere within 2e-3"),
+    "VALUE_MEMORY_HIT": ("error", "memory_hit is a probability"),
+    "VALUE_MEMORY_CELL": ("error", "entry_b2 of every record by entry lies in the cell of its column"),
+    "VALUE_MEMORY_EMPTY": ("error", "records by entry are 0 where memory_hit is"),
 }
 
 SUM_TOLERANCE = 1e-5  # of float32 masses summed in double
+CELL_TOLERANCE = 1e-6  # [R^2] of entry_b2 rounded to float32
 SPHERE_TOLERANCE = 2e-3  # [R^2] float32 loses sqrt(1 - b2) near grazing entry
 
 BLOCKS = ("p_theta", *CONDITIONALS, "mean_l")
 RECORDS = tuple(f"joint_{field}" for field in RECORD_FIELDS)
+MEMORY = ("memory_hit", *(f"memory_{field}" for field in MEMORY_FIELDS))
+KNOWN = BLOCKS + RECORDS + MEMORY
 AXIS_ENDS = {"p_r": (0.0, 2.0), "p_z": (-1.0, 2.0)}
+
+
+Breach = Callable[[str, str, np.ndarray, str], Broken]  # code, block, where it is broken, what is wrong
 
 
 def read(path: str | os.PathLike[str]) -> Table:
@@ -94,10 +107,13 @@ def write(table: Table, path: str | os.PathLike[str]) -> None:
         If the table breaks a rule of SPEC.md or the file cannot be written; nothing is left behind.
     """
     header = thawed(table.header)
-    if header.get("format_version") != FORMAT_VERSION:
+    blocks = header.get("blocks")
+    names = [str(block.get("name")) for block in blocks if isinstance(block, dict)] if isinstance(blocks, list) else []
+    if header.get("format_version") != version_for(names):
         version = container.shown(repr(header.get("format_version")))
         raise TSDFError(
-            f"cannot write {container.shown(path)}: format_version is {version}, this writes {FORMAT_VERSION}"
+            f"cannot write {container.shown(path)}: format_version is {version}, that of its blocks is "
+            f"{version_for(names)}"
         )
     container.write(header, table.pixels, path, FORMAT)
 
@@ -112,7 +128,8 @@ def _broken_manifest(header: Mapping[str, Any], width: int, height: int, newer: 
         yield "HEADER_LEDGER", "/energy_ledger/launched", message
 
     by_name = {block["name"]: block for block in blocks}
-    known = [name for name in names if name in BLOCKS + RECORDS]
+    old = header["format_version"] == "1.0"
+    known = [name for name in names if name in KNOWN and not (old and name in MEMORY)]
 
     row = 0
     for i, block in enumerate(blocks):
@@ -123,18 +140,23 @@ def _broken_manifest(header: Mapping[str, Any], width: int, height: int, newer: 
         if names.index(name) < i:
             yield "MANIFEST_DUPLICATE", f"{place}/name", f"a second block {name}"
         if name not in known and not newer:
-            yield "MANIFEST_UNKNOWN", f"{place}/name", f"version 1.0 has no block {name}"
+            yield "MANIFEST_UNKNOWN", f"{place}/name", f"version {header['format_version']} has no block {name}"
     if row != height:
         yield "MANIFEST_HEIGHT", "/blocks", f"the blocks have {row} rows, the image {height}"
     if missing := [name for name in BLOCKS if name not in names]:
         yield "MANIFEST_MISSING", "/blocks", f"there is no block {', '.join(missing)}"
-    if known != sorted(known, key=(BLOCKS + RECORDS).index):
+    if known != sorted(known, key=KNOWN.index):
         yield "MANIFEST_ORDER", "/blocks", "the blocks are not in the order of the specification"
     if len({by_name[name]["rows"] for name in ("p_l", "mean_l") if name in by_name}) > 1:
         yield "MANIFEST_MEAN", "/blocks", "mean_l has not as many rows as p_l"
     counts = [by_name[name]["rows"] for name in RECORDS if name in by_name]
     if counts and (len(counts) < len(RECORDS) or len(set(counts)) > 1):
         yield "MANIFEST_RECORDS", "/blocks", "the joint blocks are not six of equal length"
+    counts = [by_name[name]["rows"] for name in MEMORY[1:] if name in known]
+    if any(name in known for name in MEMORY) and (len(counts) < len(MEMORY_FIELDS) or len(set(counts)) > 1):
+        yield "MANIFEST_MEMORY", "/blocks", "the memory blocks of records are not seven of equal length"
+    elif counts and MEMORY[0] not in known:
+        yield "MANIFEST_MEMORY", "/blocks", "there are records by entry, but no block memory_hit"
 
     edges = header["columns"]["edges"]
     if len(edges) != width + 1:
@@ -166,7 +188,7 @@ def _broken_edges(place: str, edges: Sequence[float], atoms: tuple[int, ...], wh
 
 def _broken_values(table: Table) -> Broken:
     """Rules of the pixels, (code, place of the first breach, message); not finite ones hide all others."""
-    blocks = [block for block in table.header["blocks"] if block["name"] in BLOCKS + RECORDS]
+    blocks = [block for block in table.header["blocks"] if block["name"] in KNOWN]
     first_row = {block["name"]: block["first_row"] for block in blocks}
 
     def breach(code: str, name: str, bad: np.ndarray, what: str) -> Broken:
@@ -190,7 +212,7 @@ def _broken_values(table: Table) -> Broken:
     for name in CONDITIONALS:
         off = np.abs(table.block(name).sum(axis=0, dtype=np.float64) - 1.0) > SUM_TOLERANCE
         yield from breach("VALUE_COLUMN_SUM", name, off & ~empty, "the column does not sum to 1")
-    for name in first_row:
+    for name in (name for name in first_row if name not in MEMORY):
         filled = (table.block(name) != 0.0) & empty
         yield from breach("VALUE_EMPTY_COLUMN", name, filled, "not 0 though p_theta is")
 
@@ -200,25 +222,43 @@ def _broken_values(table: Table) -> Broken:
     bad = np.where(table.p_l == 0.0, mean != 0.0, outside)
     yield from breach("VALUE_MEAN_RANGE", "mean_l", bad, "outside its cell or of no mass")
 
-    if not (joint := table.joint):
-        return
+    if joint := table.joint:
+        atoms = np.zeros(p_theta.shape, dtype=bool)
+        atoms[[0, -1]] = True
+        yield from _broken_records("joint", joint, atoms, breach)
+    if memory := table.memory:
+        hit = table.block("memory_hit")[0]
+        yield from breach("VALUE_MEMORY_HIT", "memory_hit", ~((hit >= 0.0) & (hit <= 1.0)), "not a probability")
+        yield from _broken_records("memory", memory, np.zeros(hit.shape, dtype=bool), breach)
+        cell, b2 = np.arange(len(hit)) / len(hit), memory["entry_b2"].astype(np.float64)
+        outside = (b2 < cell - CELL_TOLERANCE) | (b2 > cell + 1.0 / len(hit) + CELL_TOLERANCE)
+        yield from breach("VALUE_MEMORY_CELL", "memory_entry_b2", outside & (hit != 0.0), "not of this column's cell")
+        for field, values in memory.items():
+            filled = (values != 0.0) & (hit == 0.0)
+            yield from breach("VALUE_MEMORY_EMPTY", f"memory_{field}", filled, "not 0 though memory_hit is")
+
+
+def _broken_records(kind: str, records: Mapping[str, np.ndarray], atoms: np.ndarray, breach: Breach) -> Broken:
+    """Rules of the records of either kind; `atoms` are the columns in which entry_azimuth must be 0, (columns,)."""
     pi = float(np.float32(math.pi))
-    low = {"r": 0.0, "z": -1.0, "phi_delta": -pi, "l": 0.0, "entry_b2": 0.0, "entry_azimuth": -pi}
-    high = {"r": 2.0, "z": 2.0, "phi_delta": pi, "l": math.inf, "entry_b2": 1.0, "entry_azimuth": pi}
-    for field, values in joint.items():
+    low = {"r": 0.0, "z": -1.0, "phi_delta": -pi, "l": 0.0, "entry_b2": 0.0, "entry_azimuth": -pi, "cos_theta": -1.0}
+    high = {"r": 2.0, "z": 2.0, "phi_delta": pi, "l": math.inf, "entry_b2": 1.0, "entry_azimuth": pi, "cos_theta": 1.0}
+    for field, values in records.items():
         bad = (values < low[field] - 1e-6) | (values > high[field] + 1e-6)
         if field == "entry_azimuth":
-            bad[:, [0, -1]] |= values[:, [0, -1]] != 0.0
-        yield from breach("VALUE_RECORD_RANGE", f"joint_{field}", bad, "out of range")
-    falling = np.zeros(joint["entry_b2"].shape, dtype=bool)
-    falling[1:] = np.diff(joint["entry_b2"], axis=0) < 0.0
-    yield from breach("VALUE_RECORD_ORDER", "joint_entry_b2", falling, "smaller than the one before")
-    r, z, phi_delta, _, b2, azimuth = (joint[field].astype(np.float64) for field in RECORD_FIELDS)
+            bad |= atoms & (values != 0.0)
+        yield from breach("VALUE_RECORD_RANGE", f"{kind}_{field}", bad, "out of range")
+    falling = np.zeros(records["entry_b2"].shape, dtype=bool)
+    falling[1:] = np.diff(records["entry_b2"], axis=0) < 0.0
+    yield from breach("VALUE_RECORD_ORDER", f"{kind}_entry_b2", falling, "smaller than the one before")
+    r, z, phi_delta, b2, azimuth = (
+        records[field].astype(np.float64) for field in ("r", "z", "phi_delta", "entry_b2", "entry_azimuth")
+    )
     b2 = np.clip(b2, 0.0, 1.0)
     # With d_in along z and x_i at azimuth 0, phi_d is entry_azimuth and phi_p is phi_delta + phi_d.
     across = r**2 + 2.0 * r * np.sqrt(b2) * np.cos(phi_delta + azimuth)
     off = np.abs(across + z**2 - 2.0 * z * np.sqrt(1.0 - b2)) > SPHERE_TOLERANCE
-    yield from breach("VALUE_RECORD_SPHERE", "joint_r", off, "the exit is off the bounding sphere")
+    yield from breach("VALUE_RECORD_SPHERE", f"{kind}_r", off, "the exit is off the bounding sphere")
 
 
 FORMAT = Format(

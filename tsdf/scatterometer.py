@@ -36,7 +36,7 @@ MAX_PATHS = 1 << 36  # 6.9e10: 2^30 in each replicate, whose energy times path l
 MAX_JOINT = 1024
 MAX_LEAK = 1e-4  # share of the light that may be lost or cut off before a grain is refused
 CHUNK_MIN, CHUNK_MAX = 1 << 13, 1 << 20
-PART_VERSION = 1
+PART_VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,8 @@ class Effort:
         0 .. 2^63 - 1.
     max_bounces : int
         Hits after which a path is cut off.
+    memory : int
+        Records per cell of entry_b2, 0 .. MAX_JOINT; there are as many cells as columns.
 
     Raises
     ------
@@ -70,6 +72,7 @@ class Effort:
     joint: int = 0
     seed: int = 0
     max_bounces: int = MAX_BOUNCES
+    memory: int = 0
 
     def __post_init__(self) -> None:
         if self.paths is not None and not (MIN_PATHS <= self.paths <= MAX_PATHS):
@@ -87,6 +90,8 @@ class Effort:
             )
         if not (0 <= self.joint <= MAX_JOINT):
             raise UsageError(f"the joint records per cell must be 0 to {MAX_JOINT}, got {self.joint}")
+        if not (0 <= self.memory <= MAX_JOINT):
+            raise UsageError(f"the records per cell of entry must be 0 to {MAX_JOINT}, got {self.memory}")
         if not (0 <= self.seed < 1 << 63):
             raise UsageError(f"the seed must be 0 to 2^63 - 1, got {self.seed}")
         if not (1 <= self.max_bounces <= 10**9):
@@ -146,6 +151,7 @@ def canonical_command(grain: Mapping[str, Any], optics: Optics, effort: Effort, 
     words += [f"--target-error {effort.target_error!r}"] if effort.target_error is not None else []
     words += [f"--cells {effort.cells}"] if effort.cells is not None else []
     words += [f"--joint {effort.joint}"] if effort.joint else []
+    words += [f"--memory {effort.memory}"] if effort.memory else []
     return " ".join(words)
 
 
@@ -166,7 +172,7 @@ def exact_sphere(grain: Grain, optics: Optics, effort: Effort) -> Table:
         "paths": 0,
         "max_bounces": None,
     }
-    return exact_table(cells, effort.target_error, effort.joint, header, optics, provenance)
+    return exact_table(cells, effort.target_error, effort.joint, header, optics, provenance, effort.memory)
 
 
 @dataclass
@@ -215,7 +221,7 @@ class Build:
                 "use --fresnel un for meshes"
             )
         effort = effort.resolved()
-        return cls(grain_header(grain), optics, effort, Tally(joint=effort.joint))
+        return cls(grain_header(grain), optics, effort, Tally(joint=effort.joint, memory=effort.memory))
 
     @property
     def request(self) -> dict[str, Any]:
@@ -313,7 +319,7 @@ class Build:
             )
             for _ in range(threads)
         ]
-        tallies = [Tally(joint=self.effort.joint) for _ in range(threads)]
+        tallies = [Tally(joint=self.effort.joint, memory=self.effort.memory) for _ in range(threads)]
         tracers[0].trace(in_order(0, T.REPLICATES), tallies[0])  # compiles what is not compiled yet
         tallies[0].clear()
         stop = threading.Event()
@@ -411,7 +417,7 @@ class Build:
             "paths": self.paths,
             "max_bounces": self.effort.max_bounces,
         }
-        return estimate.traced_table(self.tally, error.cells, self.grain, self.optics, provenance)
+        return estimate.traced_table(self.tally, error.cells, self.grain, self.optics, provenance, self.effort.memory)
 
     def save(self, path: Path) -> None:
         """Write the part file, atomically.
@@ -447,7 +453,7 @@ class Build:
                 request["grain"],
                 Optics(**request["optics"]),
                 Effort(**request["effort"]),
-                Tally(joint=request["effort"]["joint"]),
+                Tally(joint=request["effort"]["joint"], memory=request["effort"]["memory"]),
                 {int(k) for k in arrays.pop("done")},
             )
             if request != json.loads(json.dumps(build.request)):

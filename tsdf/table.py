@@ -6,7 +6,7 @@ radius R, angles in radians, absorption is the dimensionless product sigma_a R.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -15,9 +15,15 @@ import numpy as np
 
 from tsdf.errors import UsageError
 
-FORMAT_VERSION = "1.0"
+FORMAT_VERSION = "1.1"  # the newest that this reads; see `version_for`
 CONDITIONALS = ("p_phi", "p_r", "p_z", "p_l")
 RECORD_FIELDS = ("r", "z", "phi_delta", "l", "entry_b2", "entry_azimuth")
+MEMORY_FIELDS = ("cos_theta", "entry_azimuth", "r", "z", "phi_delta", "l", "entry_b2")
+
+
+def version_for(blocks: Iterable[str]) -> str:
+    """Return the format version of a table with blocks of these names: the oldest that has them all."""
+    return "1.1" if any(name.startswith("memory_") for name in blocks) else "1.0"
 
 
 def frozen(value: Any) -> Any:
@@ -117,6 +123,22 @@ class Table:
     def joint(self) -> dict[str, np.ndarray]:
         """The joint records by field, each (K, columns) float32; empty where the table holds none."""
         return {f: self.block(f"joint_{f}") for f in RECORD_FIELDS if f"joint_{f}" in self}
+
+    @property
+    def memory(self) -> dict[str, np.ndarray]:
+        """The records by entry by field, each (K, columns) float32; empty where the table holds none.
+
+        Column c of C is the cell c/C to (c + 1)/C of entry_b2, not of cos theta.
+        """
+        return {f: self.block(f"memory_{f}") for f in MEMORY_FIELDS if f"memory_{f}" in self}
+
+    @property
+    def hit(self) -> np.ndarray:
+        """Share of the rays of each cell of entry_b2 that meet the grain, (columns,) float64 in [0, 1].
+
+        It needs records by entry.
+        """
+        return self.block("memory_hit")[0].astype(np.float64)
 
     @property
     def statistics(self) -> Mapping[str, Any]:

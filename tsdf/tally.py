@@ -1,8 +1,8 @@
 """What the scatterometer counts: integer sums that add up in any order to the same total.
 
-A `Tally` is a set of int64 arrays plus, if asked for, reservoirs of joint records. Weights are fixed-point: a path
-starts with `UNIT` units of energy and every split of them is exact, so that the energy ledger balances to the last
-unit and the sum over threads, chunks and machines does not depend on their order.
+A `Tally` is a set of int64 arrays plus, if asked for, reservoirs of records by deflection and by entry. Weights are
+fixed-point: a path starts with `UNIT` units of energy and every split of them is exact, so that the energy ledger
+balances to the last unit and the sum over threads, chunks and machines does not depend on their order.
 
 Cells of theta are uniform in theta, ascending from 0, with the forward and the backward atom last; `estimate` turns
 them into the columns of a table. Lengths are in units of the bounding radius R, angles in radians.
@@ -20,6 +20,8 @@ GROUPS = 64  # cells of theta in which joint distributions are counted; divides 
 PHI, R, Z = 32, 64, 96  # cells of phi_Delta, r, z
 BOX = {"phi": 8, "r": 16, "z": 16, "l": 16}  # cells of the joint distributions
 BOX_LENGTH = 6.0  # path lengths from here on share the last cell of "l" [R]
+ENTRY = 8192  # cells of entry_b2 in which rays and misses are counted; COARSE of them hold reservoirs
+LEAST = 16  # records kept by entry at least, so that a column that lies across two cells has some
 # Path length: nothing, 1/16 up to 6, quarter octaves up to 48, then octaves
 L_FINE, L_STEP = 6.0, 16
 L_EDGES = np.concatenate(
@@ -56,8 +58,9 @@ LAUNCHED, UNSCATTERED, SCATTERED, TRUNCATED, LOST, COS_THETA, MEAN_R, MEAN_Z, PA
     11
 )
 
-# A record of the reservoirs: key, weight, then table.RECORD_FIELDS
-RECORD = 8
+# A record of the reservoirs: key, weight, then table.RECORD_FIELDS or table.MEMORY_FIELDS
+RECORD, MEMORY = 8, 9
+RESERVOIRS = ("records", "entry_records")
 
 
 @dataclass(eq=False)
@@ -68,6 +71,8 @@ class Tally:
     ----------
     joint : int
         Records kept per theta cell; 0 keeps none.
+    memory : int
+        Records kept per cell of entry_b2, LEAST or more; 0 keeps none and counts nothing by entry.
     scalars : (REPLICATES, len(SCALARS)) int64
         Energies, and energy times cos theta, r, z, l, |x_o - x_i|; miss_chord is energy times the chord of a miss.
     theta : (REPLICATES, FINE + 2) int64
@@ -82,9 +87,14 @@ class Tally:
         Energy by path length and each of phi, r, z, of the same paths.
     records : (COARSE + 2, joint + 1, RECORD) float64
         Priority samples (Duffield, Lund & Thorup 2007): the records of the smallest keys u / weight, in no order.
+    entry : (2, ENTRY or 0) int64
+        Energy of the rays, and of those that miss the grain, by entry_b2.
+    entry_records : (COARSE, memory + 1 or 0, MEMORY) float64
+        As `records`, by entry_b2.
     """
 
     joint: int = 0
+    memory: int = 0
     scalars: np.ndarray = field(default_factory=lambda: np.zeros((REPLICATES, len(SCALARS)), np.int64))
     theta: np.ndarray = field(default_factory=lambda: np.zeros((REPLICATES, FINE + 2), np.int64))
     cells: np.ndarray = field(default_factory=lambda: np.zeros((COARSE + 2, PHI + R + Z + 2 * L), np.int64))
@@ -93,10 +103,17 @@ class Tally:
         default_factory=lambda: np.zeros((2, GROUPS + 2, BOX["l"], BOX["phi"] + BOX["r"] + BOX["z"]), np.int64)
     )
     records: np.ndarray = field(default_factory=lambda: np.empty(0))
+    entry: np.ndarray = field(default_factory=lambda: np.empty(0))
+    entry_records: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
+        self.memory = max(self.memory, LEAST) if self.memory else 0
         if self.records.size == 0:
             self.records = np.full((COARSE + 2, self.joint + 1 if self.joint else 0, RECORD), np.inf)
+        if self.entry.size == 0:
+            self.entry = np.zeros((2, ENTRY if self.memory else 0), np.int64)
+        if self.entry_records.size == 0:
+            self.entry_records = np.full((COARSE, self.memory + 1 if self.memory else 0, MEMORY), np.inf)
 
     def conditional(self, name: str) -> np.ndarray:
         """Return "phi", "r", "z", "l" or "l_sum", (COARSE + 2, cells) int64, a view."""
@@ -111,21 +128,21 @@ class Tally:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays by name; views, not copies."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "joint"}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("joint", "memory")}
 
     def add(self, other: "Tally") -> None:
         """Add the counts of `other`, which holds other paths and as many records per cell."""
         for name, mine in self.arrays().items():
-            if name != "records":
+            if name not in RESERVOIRS:
                 mine += getattr(other, name)
-        if self.joint:
-            both = np.concatenate((self.records, other.records), axis=1)
-            self.records = smallest(both, self.joint + 1)
+            elif mine.size:
+                both = np.concatenate((mine, getattr(other, name)), axis=1)
+                setattr(self, name, smallest(both, mine.shape[1]))
 
     def clear(self) -> None:
         """Forget everything."""
         for name, mine in self.arrays().items():
-            mine[...] = np.inf if name == "records" else 0
+            mine[...] = np.inf if name in RESERVOIRS else 0
 
 
 def smallest(records: np.ndarray, count: int) -> np.ndarray:

@@ -65,8 +65,21 @@ def rim(p, d):
     return step(p, math.sqrt(max(0.0, along * along + (1.0 - dot(p, p)))) - along, d)
 
 
+@njit(cache=True)
+def entry_b2(p, d):
+    """Return the squared distance from the centre of the ray through p along d."""
+    side = step(p, -dot(p, d), d)
+    return min(1.0, dot(side, side))
+
+
+@njit(cache=True)
+def entry_cell(b2, cells):
+    """Return which of so many equal cells of [0, 1] holds b2."""
+    return min(int(b2 * cells), cells - 1)
+
+
 @njit(cache=True, nogil=True)
-def spawn(paths, seed, plain, directions, rays, starts, ways):
+def spawn(paths, seed, plain, directions, rays, starts, ways, by_entry):
     """Start the paths numbered: parallel light, uniform over the disc, from everywhere."""
     low, high = np.uint64(0xFFFFFFFF), np.uint64(32)
     for i in range(len(paths)):
@@ -92,6 +105,8 @@ def spawn(paths, seed, plain, directions, rays, starts, ways):
         entry = step(step(step((0.0, 0.0, 0.0), radius * c, t), radius * s, b), -math.sqrt(1.0 - u2), d)
         side = P_POLARISED if key_of(seed, path, 2) & np.uint64(1) else 0
         start(i, rays, starts, ways, entry, entry, d, entry, d, 0.0, T.UNIT, key_of(seed, path, 1), -1, side, 0, path)
+        if by_entry.shape[1] > 0:
+            by_entry[0, entry_cell(entry_b2(entry, triple(rays[i].d)), T.ENTRY)] += T.UNIT
 
 
 @njit(cache=True, inline="always")
@@ -140,28 +155,47 @@ def arc(y, x):
 
 
 @njit(cache=True)
-def keep(records, c, weight, key, r, z, phi, length, p, d, out):
-    """Offer the record of light that enters at p along d and leaves along `out` to the reservoir of cell `c`.
-
-    It stays if its key u / weight is among the smallest.
-    """
-    last = records.shape[1] - 1  # the largest key stands last
-    share = weight / T.UNIT
-    value = (1.0 - unit(key)) / share
-    if value >= records[c, last, 0]:
-        return
-    side = step(p, -dot(p, d), d)
-    row = records[c, last]
-    row[0], row[1], row[2], row[3], row[4], row[5] = value, share, r, z, phi, length
-    row[6] = min(1.0, dot(side, side))
-    row[7] = arc(dot(d, cross(side, out)), dot(side, out)) if c < T.COARSE else 0.0
-    worst = 0
+def settle(reservoir):
+    """Let the row of the largest key stand last."""
+    last, worst = reservoir.shape[0] - 1, 0
     for k in range(1, last + 1):
-        if records[c, k, 0] > records[c, worst, 0]:
+        if reservoir[k, 0] > reservoir[worst, 0]:
             worst = k
     if worst != last:
-        for k in range(T.RECORD):
-            records[c, last, k], records[c, worst, k] = records[c, worst, k], records[c, last, k]
+        for k in range(reservoir.shape[1]):
+            reservoir[last, k], reservoir[worst, k] = reservoir[worst, k], reservoir[last, k]
+
+
+@njit(cache=True)
+def azimuth_from(p, d, out):
+    """Return the azimuth of `out` about d from the side on which light along d enters at p."""
+    side = step(p, -dot(p, d), d)
+    return arc(dot(d, cross(side, out)), dot(side, out))
+
+
+@njit(cache=True)
+def keep(records, entry_records, c, weight, key, r, z, phi, length, p, d, out):
+    """Offer the record of light that enters at p along d and leaves along `out` to the reservoirs.
+
+    Those of cell `c` of theta and of its cell of entry_b2: it stays if its key u / weight is among the smallest.
+    """
+    share = weight / T.UNIT
+    value = (1.0 - unit(key)) / share
+    if records.shape[1] > 0 and value < records[c, -1, 0]:
+        row = records[c, -1]
+        row[0], row[1], row[2], row[3], row[4], row[5] = value, share, r, z, phi, length
+        row[6] = entry_b2(p, d)
+        row[7] = azimuth_from(p, d, out) if c < T.COARSE else 0.0
+        settle(records[c])
+    if entry_records.shape[1] > 0:
+        b2 = entry_b2(p, d)
+        reservoir = entry_records[entry_cell(b2, T.COARSE)]
+        if value < reservoir[-1, 0]:
+            row = reservoir[-1]
+            row[0], row[1], row[2] = value, share, min(max(dot(d, out), -1.0), 1.0)
+            row[3] = azimuth_from(p, d, out) if c < T.COARSE else 0.0
+            row[4], row[5], row[6], row[7], row[8] = r, z, phi, length, b2
+            settle(reservoir)
 
 
 @njit(cache=True)
@@ -230,7 +264,8 @@ def count_offset(cells, c, box, box_l, half, g, lb, boxed, weight, r, z, phi):
 def count_block(count, block, edges, counters):
     """Count the light of a block's first `count` columns, as it is and walked backwards, which is as likely."""
     left, notes, found = block
-    scalars, theta, cells, box, box_l, records = counters
+    scalars, theta, cells, box, box_l, records, _, entry_records = counters
+    kept = records.shape[1] > 0 or entry_records.shape[1] > 0
     measure(count, left, found)
     for i in range(count):
         p, d, entry, d_in = column(left, 0, i), column(left, 3, i), column(left, 6, i), column(left, 9, i)
@@ -272,11 +307,12 @@ def count_block(count, block, edges, counters):
             count_offset(cells, c, box, box_l, half, g, lb, boxed, forth, r, z, phi)
         if back > 0:
             count_offset(cells, c, box, box_l, half, g, lb, boxed, back, r_back, z_back, phi_back)
-        if records.shape[1] > 0 and forth > 0:
-            keep(records, c, forth, mix(key + np.uint64(0x51)), r, z, phi, length, entry, d_in, d)
-        if records.shape[1] > 0 and back > 0:
+        if kept and forth > 0:
+            once = mix(key + np.uint64(0x51))
+            keep(records, entry_records, c, forth, once, r, z, phi, length, entry, d_in, d)
+        if kept and back > 0:
             again, exit = mix(key + np.uint64(0x52)), rim(p, d)
-            keep(records, c, back, again, r_back, z_back, phi_back, length, exit, minus(d), minus(d_in))
+            keep(records, entry_records, c, back, again, r_back, z_back, phi_back, length, exit, minus(d), minus(d_in))
 
 
 @njit(cache=True, inline="always")
@@ -294,7 +330,7 @@ def advance(count, prims, sphere, planes, centroids, horizon, eta, polarisation,
 
     What goes on is packed into next_rays and, for the ray engine, starts and ways.
     """
-    scalars, (left, notes, _) = counters[0], block
+    scalars, by_entry, (left, notes, _) = counters[0], counters[6], block
     live, held = 0, 0
     for i in range(count):
         if held > BLOCK - fan_size:
@@ -313,6 +349,8 @@ def advance(count, prims, sphere, planes, centroids, horizon, eta, polarisation,
             else:
                 scalars[replicate, T.UNSCATTERED] += weight
                 scalars[replicate, T.MISS_CHORD] += rounded(weight * -2.0 * dot(p, d))
+                if by_entry.shape[1] > 0:
+                    by_entry[1, entry_cell(entry_b2(p, d), T.ENTRY)] += weight
             continue
 
         # The hit, on the facet's plane (or the sphere), with its normal
@@ -503,13 +541,19 @@ class Tracer:
 
         Once `stop` is set the counts are worthless.
         """
-        counters = (tally.scalars, tally.theta, tally.cells, tally.box, tally.box_l, tally.records)
+        counters = (
+            tally.scalars, tally.theta, tally.cells, tally.box, tally.box_l, tally.records, tally.entry,
+            tally.entry_records,
+        )  # fmt: skip
         first, live, total = 0, 0, 0
         tally.scalars[:, T.LAUNCHED] += T.UNIT * np.bincount(paths % T.REPLICATES, minlength=T.REPLICATES)
         while (live or first < len(paths)) and not (stop is not None and stop.is_set()):
             if live < self.slots // 2 and first < len(paths):
                 fresh = paths[first : first + self.slots - live]
-                spawn(fresh, self.seed, self.plain, SOBOL, self._rays[live:], self._starts[live:], self._ways[live:])
+                spawn(
+                    fresh, self.seed, self.plain, SOBOL, self._rays[live:], self._starts[live:], self._ways[live:],
+                    tally.entry,
+                )  # fmt: skip
                 first, live = first + len(fresh), live + len(fresh)
             self._reserve((1 + self._fan) * live)
             starts, ways = self._starts[:live], self._ways[:live]
