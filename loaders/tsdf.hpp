@@ -27,7 +27,7 @@
 
 namespace tsdf {
 
-constexpr int format_major = 1, format_minor = 0;  // of the specification that this reads
+constexpr int format_major = 1, format_minor = 1;  // of the specification that this reads
 constexpr double pi = 3.14159265358979323846;
 
 // A broken rule: its code in section 9 of SPEC.md, where, and one line of text.
@@ -98,6 +98,11 @@ struct Table {
     Block p_theta, p_phi, p_r, p_z, p_l, mean_l;
     std::size_t records = 0;                                                              // joint records per column
     Block joint_r, joint_z, joint_phi_delta, joint_l, joint_entry_b2, joint_entry_azimuth;  // empty if there are none
+    // Records by entry, of which column c is the cell c / columns .. (c + 1) / columns of entry_b2; empty if there are
+    // none. memory_hit is the share of the rays of the cell that meet the grain.
+    std::size_t memory_records = 0;
+    Block memory_hit, memory_cos_theta, memory_entry_azimuth, memory_r, memory_z, memory_phi_delta, memory_l;
+    Block memory_entry_b2;
     Statistics statistics, standard_errors;
     double bounding_radius = 0;  // R, in the unit of the grain's source
     double eta = 0;              // refractive index inside over outside
@@ -729,13 +734,16 @@ inline bool obeys(const Value& v, const Key& key) {
 }
 
 constexpr double inf = std::numeric_limits<double>::infinity();
-constexpr int block_names = 12, required_blocks = 6;
+// Joint records begin after the blocks that are required; what is new in 1.1, records by entry, after those.
+constexpr int block_names = 20, required_blocks = 6, old_blocks = 12;
 
-// The blocks of version 1.0 in their order.
+// The blocks of version 1.1 in their order.
 inline const char* block_name(int i) noexcept {
     static constexpr const char* names[block_names] = {
         "p_theta", "p_phi",   "p_r",             "p_z",     "p_l",            "mean_l",
-        "joint_r", "joint_z", "joint_phi_delta", "joint_l", "joint_entry_b2", "joint_entry_azimuth"};
+        "joint_r", "joint_z", "joint_phi_delta", "joint_l", "joint_entry_b2", "joint_entry_azimuth",
+        "memory_hit", "memory_cos_theta", "memory_entry_azimuth", "memory_r", "memory_z", "memory_phi_delta",
+        "memory_l", "memory_entry_b2"};
     return names[i];
 }
 
@@ -852,7 +860,8 @@ class Reader {
         const Value* features = table.header.find("required_features");
         if (features != nullptr && features->type == Value::Type::array && !features->items.empty())
             return fail("VERSION_FEATURE", "the file needs a feature that is unknown here", "/required_features/0");
-        newer = minor != std::to_string(format_minor);  // there is none below 0
+        old = minor == "0";
+        newer = !old && minor != std::to_string(format_minor);
         if (newer)
             result.warnings.push_back({"VERSION_MINOR", "/format_version",
                                        "the format version is newer than " + known + ", and what is new is ignored"});
@@ -1024,8 +1033,13 @@ class Reader {
         if (i == 5)
             return object(v, place, {name, first, rows, word_of("kind", "|mean|"), word_of("of", "|p_l|"),
                                      word_of("unit", "|R|")});
-        static constexpr const char* unit[block_names] = {"", "|rad|", "|R|", "|R|", "|R|", "",
-                                                          "|R|", "|R|", "|rad|", "|R|", "|R^2|", "|rad|"};
+        if (i == old_blocks) {
+            const Key one{"rows", Kind::integer, 1, false, 1};
+            return object(v, place, {name, first, one, word_of("kind", "|probability|")});
+        }
+        static constexpr const char* unit[block_names] = {
+            "", "|rad|", "|R|", "|R|", "|R|", "", "|R|", "|R|", "|rad|", "|R|", "|R^2|", "|rad|",
+            "", "|1|", "|rad|", "|R|", "|R|", "|rad|", "|R|", "|R^2|"};
         if (i > 5) return object(v, place, {name, first, rows, word_of("kind", "|record|"), word_of("unit", unit[i])});
         static constexpr const char* quantity[] = {"", "|phi_delta|", "|r|", "|z|", "|l|"};
         return object(v, place, {name, first, rows, word_of("kind", "|mass|"), word_of("quantity", quantity[i]),
@@ -1054,7 +1068,7 @@ class Reader {
         return true;
     }
 
-    // Number of a block of version 1.0, -1 for any other.
+    // Number of a block of version 1.1, -1 for any other.
     static int known(const std::string& name) noexcept {
         for (int i = 0; i < block_names; ++i)
             if (name == block_name(i)) return i;
@@ -1065,7 +1079,8 @@ class Reader {
         Block* const all[block_names] = {
             &table.p_theta, &table.p_phi,   &table.p_r,             &table.p_z,     &table.p_l,            &table.mean_l,
             &table.joint_r, &table.joint_z, &table.joint_phi_delta, &table.joint_l, &table.joint_entry_b2,
-            &table.joint_entry_azimuth};
+            &table.joint_entry_azimuth, &table.memory_hit, &table.memory_cos_theta, &table.memory_entry_azimuth,
+            &table.memory_r, &table.memory_z, &table.memory_phi_delta, &table.memory_l, &table.memory_entry_b2};
         return *all[i];
     }
 
@@ -1095,8 +1110,9 @@ class Reader {
             for (std::size_t j = 0; j < i; ++j)
                 if (blocks[j].find("name")->text == name)
                     return fail("MANIFEST_DUPLICATE", "a second block of this name", place + "/name");
-            const int k = known(name);
-            if (k < 0 && !newer) return fail("MANIFEST_UNKNOWN", "version 1.0 has no such block", place + "/name");
+            const int any = known(name), k = old && any >= old_blocks ? -1 : any;
+            if (k < 0 && !newer)
+                return fail("MANIFEST_UNKNOWN", "the version of the file has no such block", place + "/name");
             if (k < 0) continue;
             order.push_back(k);
             block(k).first_row = first;
@@ -1114,9 +1130,14 @@ class Reader {
         if (table.mean_l.rows != table.p_l.rows)
             return fail("MANIFEST_MEAN", "mean_l has not as many rows as p_l", "/blocks");
         table.records = table.joint_r.rows;
-        for (int k = required_blocks; k < block_names; ++k)
+        for (int k = required_blocks; k < old_blocks; ++k)
             if (block(k).rows != table.records)
                 return fail("MANIFEST_RECORDS", "the joint blocks are not six of equal length", "/blocks");
+        table.memory_records = table.memory_entry_b2.rows;
+        for (int k = old_blocks; k < block_names; ++k)
+            if (block(k).rows != (k > old_blocks ? table.memory_records : table.memory_records > 0 ? 1u : 0u))
+                return fail("MANIFEST_MEMORY", "the memory blocks are not memory_hit and seven of equal length",
+                            "/blocks");
 
         for (const Value& edge : table.header.find("columns")->find("edges")->items)
             table.cos_theta_edges.push_back(edge.number);
@@ -1227,7 +1248,7 @@ class Reader {
             };
             if (!sound(k, "VALUE_COLUMN_SUM", "the column does not sum to 1", off)) return false;
         }
-        for (int k = 0; k < block_names; ++k) {
+        for (int k = 0; k < old_blocks; ++k) {
             const auto filled = [&](size_t, size_t x, float v) { return drawn[x] == 0.0f && v != 0.0f; };
             if (!sound(k, "VALUE_EMPTY_COLUMN", "not 0 though p_theta is", filled)) return false;
         }
@@ -1237,15 +1258,40 @@ class Reader {
             return mean * (1.0 + 1e-6) < table.p_l.edges[y] || mean * (1.0 - 1e-6) > upper;
         };
         if (!sound(5, "VALUE_MEAN_RANGE", "outside its cell or of no mass", outside)) return false;
-        return table.records == 0 || joint();
+        // Blocks of the joint records, and of the records by entry: r, z, phi_delta, entry_b2, entry_azimuth
+        static constexpr int of_joint[] = {6, 7, 8, 10, 11}, of_memory[] = {15, 16, 17, 19, 14};
+        return (table.records == 0 || records(required_blocks, old_blocks, of_joint)) &&
+               (table.memory_records == 0 || memory(of_memory));
     }
 
-    bool joint() {
+    bool memory(const int (&of_memory)[5]) {
+        using std::size_t;
+        const auto unlikely = [](size_t, size_t, float v) { return v < 0.0f || v > 1.0f; };
+        if (!sound(old_blocks, "VALUE_MEMORY_HIT", "not a probability", unlikely) ||
+            !records(old_blocks + 1, block_names, of_memory))
+            return false;
+        const float* hit = table.row(table.memory_hit.first_row);
+        const auto strays = [&](size_t, size_t x, float v) {
+            const double low = double(x) / double(table.columns), high = low + 1.0 / double(table.columns);
+            return hit[x] != 0.0f && (double(v) < low - 1e-6 || double(v) > high + 1e-6);
+        };
+        if (!sound(of_memory[3], "VALUE_MEMORY_CELL", "not of this column's cell", strays)) return false;
+        const auto filled = [&](size_t, size_t x, float v) { return hit[x] == 0.0f && v != 0.0f; };
+        for (int k = old_blocks + 1; k < block_names; ++k)
+            if (!sound(k, "VALUE_MEMORY_EMPTY", "not 0 though memory_hit is", filled)) return false;
+        return true;
+    }
+
+    // Rules of the records in the blocks from `first` to before `end`; `of` as in `values`.
+    bool records(int first, int end, const int (&of)[5]) {
         using std::size_t;
         static constexpr float turn = 3.14159274f;  // pi as float32
-        static constexpr float low[] = {0.0f, -1.0f, -turn, 0.0f, 0.0f, -turn};
-        static constexpr float high[] = {2.0f, 2.0f, turn, std::numeric_limits<float>::infinity(), 1.0f, turn};
-        for (int k = required_blocks; k < block_names; ++k) {
+        static constexpr float none = std::numeric_limits<float>::infinity();
+        static constexpr float low[] = {0.0f, -1.0f, -turn, 0.0f, 0.0f, -turn, 0.0f,  // joint records, memory_hit,
+                                        -1.0f, -turn, 0.0f, -1.0f, -turn, 0.0f, 0.0f};  // records by entry
+        static constexpr float high[] = {2.0f, 2.0f, turn, none, 1.0f, turn, 1.0f,
+                                         1.0f, turn, 2.0f, 2.0f, turn, none, 1.0f};
+        for (int k = first; k < end; ++k) {
             const int i = k - required_blocks;
             const auto outside = [&](size_t, size_t x, float v) {
                 return v < low[i] - 1e-6f || v > high[i] + 1e-6f ||
@@ -1253,20 +1299,18 @@ class Reader {
             };
             if (!sound(k, "VALUE_RECORD_RANGE", "out of range", outside)) return false;
         }
-        const auto value = [&](const Block& b, size_t y, size_t x) { return double(table.row(b.first_row + y)[x]); };
-        const auto falls = [&](size_t y, size_t x, float v) {
-            return y > 0 && double(v) < value(table.joint_entry_b2, y - 1, x);
-        };
-        if (!sound(10, "VALUE_RECORD_ORDER", "smaller than the one before", falls)) return false;
+        const auto value = [&](int k, size_t y, size_t x) { return double(table.row(block(k).first_row + y)[x]); };
+        const auto falls = [&](size_t y, size_t x, float v) { return y > 0 && double(v) < value(of[3], y - 1, x); };
+        if (!sound(of[3], "VALUE_RECORD_ORDER", "smaller than the one before", falls)) return false;
         // With d_in along z and x_i at azimuth 0, phi_d is entry_azimuth and phi_p is phi_delta + phi_d
         const auto off = [&](size_t y, size_t x, float v) {
-            const double r = double(v), z = value(table.joint_z, y, x);
-            const double b2 = (std::min)((std::max)(value(table.joint_entry_b2, y, x), 0.0), 1.0);
-            const double phi_p = value(table.joint_phi_delta, y, x) + value(table.joint_entry_azimuth, y, x);
+            const double r = double(v), z = value(of[1], y, x);
+            const double b2 = (std::min)((std::max)(value(of[3], y, x), 0.0), 1.0);
+            const double phi_p = value(of[2], y, x) + value(of[4], y, x);
             return std::abs(r * r + 2.0 * r * std::sqrt(b2) * std::cos(phi_p) + z * z - 2.0 * z * std::sqrt(1.0 - b2)) >
                    2e-3;
         };
-        return sound(6, "VALUE_RECORD_SPHERE", "the exit is off the bounding sphere", off);
+        return sound(of[0], "VALUE_RECORD_SPHERE", "the exit is off the bounding sphere", off);
     }
 
     const std::uint8_t* data;
@@ -1275,7 +1319,7 @@ class Reader {
     Result& result;
     std::vector<Attribute> found;
     std::size_t header_end = 0;
-    bool newer = false;
+    bool newer = false, old = false;
 };
 
 }  // namespace detail

@@ -386,10 +386,10 @@ class Memory:
 def memory_of(tally: Tally, columns: int, count: int) -> Memory:
     """Return `count` records for each of so many equal cells of entry_b2.
 
-    The cells do not end where the reservoirs do. Of the reservoirs that a cell touches, the least of the largest keys is
-    a threshold that does not change with the key of any record below it. So the records below it are a priority sample
-    of all that light and of any part of it: each stands for its weight, or for the inverse threshold if that is more,
-    and `count` are drawn in proportion to that.
+    The cells do not end where the reservoirs do. Of the reservoirs that a cell touches, the least of the largest keys
+    is a threshold that does not change with the key of any record below it. So the records below it are a priority
+    sample of all that light and of any part of it: each stands for its weight, or for the inverse threshold if that is
+    more, and `count` are drawn in proportion to that.
     """
     b2 = 2 + MEMORY_FIELDS.index("entry_b2")
     rays, met = _in_equal_cells(np.stack((tally.entry[0], tally.entry[0] - tally.entry[1])), columns)
