@@ -20,7 +20,7 @@ from tsdf.reference_data.make_golden import Header, file
 from tsdf.table import thawed
 
 CHECKS = Path(__file__).parent / "golden" / "checks"
-BASES = ("sphere", "cube", "cube_identity")
+BASES = ("sphere", "cube", "cube_identity", "sphere_memory", "cube_memory")
 
 
 def bases() -> None:
@@ -41,13 +41,19 @@ def bases() -> None:
 
     made = {"command": "python -m tsdf.reference_data.make_checks --bases"}
     exact = {**made, "method": "exact", "seed": None, "paths": 0, "max_bounces": None}
-    tables = {"sphere": exact_table(40, None, 4, grain_of("sphere")[1], Optics(1.333, "sp"), exact)}
-    for name, eta, cells, joint, paths in (("cube", 1.31, 16, 8, 1 << 17), ("cube_identity", 1.0, 8, 0, 1 << 16)):
+    sphere = grain_of("sphere")[1]
+    tables = {"sphere": exact_table(40, None, 4, sphere, Optics(1.333, "sp"), exact)}
+    tables["sphere_memory"] = exact_table(16, None, 0, sphere, Optics(1.31), exact, memory=16)
+    for name, eta, cells, joint, memory, paths in (
+        ("cube", 1.31, 16, 8, 0, 1 << 17),
+        ("cube_identity", 1.0, 8, 0, 0, 1 << 16),
+        ("cube_memory", 1.31, 16, 0, 32, 1 << 17),
+    ):
         grain, shape = grain_of("cube")
-        tally = Tally(joint)
+        tally = Tally(joint, memory)
         Tracer(grain, eta, seed=1).trace(np.arange(paths), tally)
         traced = {**made, "method": "traced", "seed": 1, "paths": paths, "max_bounces": 100_000}
-        tables[name] = estimate.traced_table(tally, cells, shape, Optics(eta), traced)
+        tables[name] = estimate.traced_table(tally, cells, shape, Optics(eta), traced, memory)
     CHECKS.mkdir(parents=True, exist_ok=True)
     for name, table in tables.items():
         format.write(table, CHECKS / f"{name}.tsdf.exr")
@@ -143,6 +149,23 @@ def checks() -> dict[str, bytes]:
     edit("STATISTICS_RECORDS", "cube", shuffle)
     edit("STATISTICS_RECORD_SUPPORT", "sphere", stretch)
     edit("PHYSICS_RECIPROCITY", "cube", turn)
+
+    def scale(block: str, factor: float) -> Callable[[Change], None]:
+        def change(c: Change) -> None:
+            c.block(block)[...] *= np.float32(factor)
+
+        return change
+
+    def lean(c: Change) -> None:
+        azimuth, phi_delta = (c.block(f"memory_{name}")[5, 9:10] for name in ("entry_azimuth", "phi_delta"))
+        less = 0.25 if azimuth > 1.0 else -0.25
+        azimuth -= less
+        phi_delta += less
+
+    edit("STATISTICS_MEMORY_HIT", "cube_memory", scale("memory_hit", 0.98))
+    edit("STATISTICS_MEMORY-cosine", "cube_memory", scale("memory_cos_theta", 0.5))
+    edit("STATISTICS_MEMORY-path_length", "sphere_memory", scale("memory_l", 1.25))
+    edit("PHYSICS_SPHERE_MEMORY", "sphere_memory", lean)
 
     def brighten(column: int, factor: float) -> Callable[[Change], None]:
         def change(c: Change) -> None:

@@ -16,6 +16,7 @@ from tsdf import estimate, format
 from tsdf.grains import load_grain
 from tsdf.optics import Optics
 from tsdf.reference_data import make_checks
+from tsdf.scatterometer import Effort, exact_sphere
 from tsdf.table import Table, thawed
 from tsdf.tally import Tally
 from tsdf.tracer import Tracer
@@ -25,15 +26,17 @@ CHECKS = make_checks.CHECKS
 FAULTS = sorted(path.name.removesuffix(".json") for path in CHECKS.glob("*.json"))
 
 
-def traced(name="sphere", eta=1.333, paths=1 << 15, cells=64, fresnel="un", joint=4, seed=3, scale=1.0) -> Table:
+def traced(
+    name="sphere", eta=1.333, paths=1 << 15, cells=64, fresnel="un", joint=4, seed=3, scale=1.0, memory=0
+) -> Table:
     """Return a freshly traced table; `scale` is a fault of the tracer's reflectance."""
     grain = load_grain(name)
-    tally = Tally(joint)
+    tally = Tally(joint, memory)
     Tracer(grain, eta, fresnel, seed, reflectance_scale=scale).trace(np.arange(paths), tally)
     shape = {key: getattr(grain, key) for key in ("kind", "name", "bounding_radius", "area", "volume", "convex")}
     shape |= {"parameters": {}, "bodies": grain.bodies, "faces": len(grain.faces), "mesh_sha256": None, "notes": []}
     made = {"command": "", "method": "traced", "seed": seed, "paths": paths, "max_bounces": 100_000}
-    return estimate.traced_table(tally, cells, shape, Optics(eta, fresnel), made)
+    return estimate.traced_table(tally, cells, shape, Optics(eta, fresnel), made, memory)
 
 
 def errors(table: Table) -> set[str]:
@@ -129,11 +132,42 @@ def test_a_newer_minor_version_is_a_warning_of_the_structure():
         {"name": "tetrahedron", "eta": 1.31, "cells": 128, "paths": 1 << 12},
         {"name": "snow", "eta": 1.31, "paths": 1 << 13},
         {"name": "cube", "eta": 1.0},
+        {"memory": 8},
+        {"memory": 1, "fresnel": "sp"},
+        {"memory": 8, "eta": 0.75},
+        {"memory": 8, "eta": 1.0},
+        {"memory": 32, "paths": 1 << 10, "cells": 8},
+        {"memory": 4, "paths": 1 << 10, "cells": 512, "name": "tetrahedron", "eta": 1.31},
+        {"memory": 4, "name": "cube", "eta": 1.31},
+        {"memory": 8, "name": "snow", "eta": 1.31, "paths": 1 << 13},
     ],
     ids=str,
 )
 def test_honest_noisy_tables_pass(made):
     assert errors(traced(**made)) == set()
+
+
+@pytest.mark.parametrize(("eta", "fresnel"), [(1.31, "un"), (1.5, "sp"), (3.0, "un"), (0.75, "sp"), (1.0, "un")])
+@pytest.mark.parametrize("memory", [1, 32])
+def test_records_by_entry_of_exact_spheres_pass(eta, fresnel, memory):
+    assert errors(exact_sphere(load_grain("sphere"), Optics(eta, fresnel), Effort(cells=62, memory=memory))) == set()
+
+
+def test_records_by_entry_of_another_grain_fail():
+    """Those of another eta, of another solid, or of fewer hits, below an otherwise sound table."""
+    first = next(b["first_row"] for b in traced(memory=32).header["blocks"] if b["name"] == "memory_hit")
+
+    def grafted(onto: Table, graft: Table) -> set[str]:
+        return errors(Table(onto.header, np.concatenate((onto.pixels[:first], graft.pixels[first:]))))
+
+    sphere, cube = traced(memory=32), traced(name="cube", eta=1.333, memory=32)
+    assert grafted(sphere, traced(memory=32, seed=4)) == set()
+    assert grafted(sphere, traced(memory=32, eta=1.38)) == {"PHYSICS_SPHERE_MEMORY"}
+    assert grafted(sphere, cube) == {"STATISTICS_MEMORY_HIT", "STATISTICS_MEMORY", "PHYSICS_SPHERE_MEMORY"}
+    assert grafted(cube, traced(name="octahedron", eta=1.333, memory=32)) == {
+        "STATISTICS_MEMORY_HIT",
+        "STATISTICS_MEMORY",
+    }
 
 
 @pytest.mark.parametrize("scale", [0.98, 1.02])

@@ -716,22 +716,30 @@ def sphere_events(eta: float, fresnel: str = "un", intervals: int = 65536) -> Sp
     return SphereEvents(weight, start, stop, r, z, phi, length, b2, azimuth, order, float(residual))
 
 
-def sphere_direction(entry_b2: ArrayLike, order: ArrayLike, eta: float) -> tuple[Array, Array]:
-    """Direction in which light leaves the sphere, in its plane of incidence.
+class SpherePath(NamedTuple):
+    """Where light leaves the sphere and whereto, in its plane of incidence; +y is the side of the entry point [1]."""
+
+    along: Array  # part of d_out along d_in, which is cos_theta
+    aside: Array  # and along y
+    exit_along: Array  # parts of the outward normal where it leaves
+    exit_aside: Array
+
+
+def sphere_path(entry_b2: ArrayLike, order: ArrayLike, eta: float) -> SpherePath:
+    """Return where light leaves the sphere and whereto, of n entry points and orders.
 
     Parameters
     ----------
     entry_b2 : (n,) array_like of float64
         Impact parameter squared, in [0, 1] [R^2].
     order : (n,) array_like of float64
-        Number of chords; no meaning where light with entry_b2 > eta^2 is said to have one.
+        Number of chords; light with entry_b2 > eta^2 has none.
     eta : float
         Relative refractive index, > 0 [1].
 
     Returns
     -------
-    along, aside : (n,) ndarray of float64
-        Parts along d_in, which is cos_theta, and across it towards the side of the entry point [1].
+    SpherePath
 
     Raises
     ------
@@ -746,7 +754,7 @@ def sphere_direction(entry_b2: ArrayLike, order: ArrayLike, eta: float) -> tuple
     ti, tt = np.arctan2(b, np.sqrt(1 - b2)), np.arctan2(b, np.sqrt(np.maximum(eta * eta - b2, 0.0)))
     turn = 2 * (p * tt - ti)
     flip = np.where(p % 2 == 1, 1.0, -1.0)
-    return flip * np.cos(turn), flip * np.sin(turn)
+    return SpherePath(flip * np.cos(turn), flip * np.sin(turn), flip * np.cos(turn + ti), flip * np.sin(turn + ti))
 
 
 # --- Fresnel and theorems -----------------------------------------------------------------------------------

@@ -87,7 +87,7 @@ def _memory(events: analytic.SphereEvents, eta: float, columns: int, count: int)
     The sum runs through the orders one after the other, so that the records of a cell hold each with its share of the
     light and spread over the cell.
     """
-    along, _ = analytic.sphere_direction(events.entry_b2, events.order, eta)
+    along = analytic.sphere_path(events.entry_b2, events.order, eta).along
     by_name = {"cos_theta": along, "l": events.path_length}
     fields = np.stack([by_name[name] if name in by_name else getattr(events, name) for name in MEMORY_FIELDS])
     column = np.minimum((events.entry_b2 * columns).astype(np.int64), columns - 1)

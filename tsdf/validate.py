@@ -48,6 +48,11 @@ CODES = {
     "STATISTICS_FITS": ("error", "each fit is as far from p_theta as it states"),
     "STATISTICS_RECORDS": ("error", "the joint records are a sample of the conditionals of their column"),
     "STATISTICS_RECORD_SUPPORT": ("error", "no joint record lies where the conditionals have no mass"),
+    "STATISTICS_MEMORY_HIT": ("error", "the mean of memory_hit is hit_probability"),
+    "STATISTICS_MEMORY": (
+        "error",
+        "records by entry, as many as memory_hit says, have the mean cosine, r, z and l of the statistics",
+    ),
     "PHYSICS_SPHERE_STATISTICS": ("error", "the statistics of a sphere are those of geometrical optics"),
     "PHYSICS_SPHERE_P_THETA": ("error", "p_theta of a sphere is that of geometrical optics"),
     "PHYSICS_SPHERE_PLANE": ("error", "phi_delta of a sphere is 0 or pi"),
@@ -55,6 +60,7 @@ CODES = {
         "error",
         "p_phi, p_r, p_z and p_l of a sphere are those of geometrical optics",
     ),
+    "PHYSICS_SPHERE_MEMORY": ("error", "records by entry of a sphere are its rays, by geometrical optics"),
     "PHYSICS_ZHOU_CURVE": (
         "error",
         "at eta 1.333 p_theta follows Fig. 8 of Zhou et al. 2003, or its average",
@@ -86,6 +92,8 @@ SIGMAS = 5.0  # allowed standard errors; with 64 replicates, 1 in 200 000 exceed
 ROUNDING = 1e-6  # of float32 masses summed over the table, and of the oracles
 LEDGER_ROUNDING = 1e-8  # hit_probability and albedo are quotients of integers
 RECORD_EXCESS = 2.0  # records may scatter this many times more than unrelated draws
+RECORD_ROUNDING = 2e-3  # [R] of float32 near grazing entry, as in SPEC.md; there is more of it the more chords
+CHORD = 0.02  # shortest chord by which records of a sphere are judged [R]
 DROPPED, DROPPED_MUCH = 1e-6, 1e-4
 ZHOU_ETA = 1.333
 ZHOU_CELLS = 0.01  # cell means of the published curve between its half degrees; 0.0065 measured
@@ -145,6 +153,7 @@ def judge(table: Table) -> tuple[tuple[Finding, ...], int]:
     subject = _Subject.of(table)
     _statistics(gavel, subject)
     _records(gavel, subject)
+    _memory(gavel, subject)
     if subject.kind == "sphere":
         _sphere(gavel, subject)
     _theorems(gavel, subject)
@@ -518,6 +527,70 @@ def _records(gavel: _Judge, t: _Subject) -> None:
     gavel.near("PHYSICS_RECIPROCITY", f"/blocks/{place['joint_z']}", what, mean, 0.0, allowed)
 
 
+# --- records by entry ---------------------------------------------------------------
+
+
+def _memory(gavel: _Judge, t: _Subject) -> None:
+    """The records by entry against the statistics, which the same light has."""
+    memory = t.table.memory
+    if not memory:
+        return
+    hit, paths = t.table.hit, t.header["provenance"]["paths"]
+    place = {block["name"]: i for i, block in enumerate(t.header["blocks"])}
+    # of rays that do not know of each other; a cell in which none entered says 0
+    doubt = hit * (1.0 - hit) * len(hit) / paths if paths else np.zeros(len(hit))
+    unlit = math.exp(-paths / len(hit)) if paths else 0.0
+    allowed = t.noise("hit_probability") + SIGMAS * math.sqrt(doubt.mean() / len(hit)) + ROUNDING
+    allowed += unlit + SIGMAS * math.sqrt(unlit / len(hit))
+    pointer, what = f"/blocks/{place['memory_hit']}", "the mean of memory_hit"
+    gavel.near("STATISTICS_MEMORY_HIT", pointer, what, float(hit.mean()), t.s["hit_probability"], allowed)
+    if not hit.any():
+        return
+
+    weight = hit / hit.sum()
+    distinct = 1 + (np.diff(memory["entry_b2"], axis=0) != 0.0).sum(axis=0)
+    names = {"cos_theta": "mean_cosine", "r": "mean_r", "z": "mean_z", "l": "mean_path_length"}
+    for name, statistic in names.items():
+        values = memory[name].astype(np.float64)
+        means = values.mean(axis=0)
+        mean = float(weight @ means)
+        variance = values.var(axis=0) + float(weight @ ((values - mean) ** 2).mean(axis=0)) / distinct
+        error = float((weight**2 * variance / distinct).sum()) * RECORD_EXCESS
+        error += float((doubt * (means - mean) ** 2).sum()) / hit.sum() ** 2
+        slack = SIGMAS * math.sqrt(error) + t.noise(statistic) + ROUNDING
+        slack += 2.0 * (unlit + t.dropped) * float(np.abs(values).max())
+        pointer, what = f"/blocks/{place[f'memory_{name}']}", f"the mean of memory_{name}"
+        gavel.near("STATISTICS_MEMORY", pointer, what, mean, t.s[statistic], slack)
+
+
+def _sphere_memory(gavel: _Judge, t: _Subject) -> None:
+    """Each record by entry is a ray of the sphere: a whole number of chords, in one plane, by Snell's law."""
+    memory = {name: values.astype(np.float64).ravel() for name, values in t.table.memory.items()}
+    if not memory:
+        return
+    b2 = np.clip(memory["entry_b2"], 0.0, 1.0)
+    chord = 2.0 * np.sqrt(np.maximum(1.0 - b2 / t.eta**2, 0.0))
+    told = (chord > CHORD) | (memory["l"] == 0.0)  # else float32 does not tell how many there are
+    order = np.where(memory["l"] == 0.0, 0.0, np.rint(memory["l"] / np.maximum(chord, CHORD)))
+    path = analytic.sphere_path(b2, order, t.eta)
+    azimuth, sine = memory["entry_azimuth"], np.sqrt(np.maximum(1.0 - memory["cos_theta"] ** 2, 0.0))
+    phi_p = memory["phi_delta"] + azimuth
+    deviations = (
+        memory["cos_theta"] - path.along,
+        sine * np.cos(azimuth) - path.aside,
+        sine * np.sin(azimuth),
+        memory["z"] - np.sqrt(1.0 - b2) - path.exit_along,
+        memory["r"] * np.cos(phi_p) + np.sqrt(b2) - path.exit_aside,
+        memory["r"] * np.sin(phi_p),
+        (memory["l"] - order * chord) / np.maximum(order, 1.0),
+    )
+    off = np.abs(deviations).max(axis=0) > RECORD_ROUNDING * (1.0 + 0.01 * order)
+    count = int(np.count_nonzero(off & told))
+    pointer = f"/blocks/{next(i for i, b in enumerate(t.header['blocks']) if b['name'] == 'memory_cos_theta')}"
+    text = f"{count} of {int(told.sum())} records by entry are no ray of this sphere, 0 allowed"
+    gavel.require(count == 0, "PHYSICS_SPHERE_MEMORY", pointer, text)
+
+
 # --- physics ------------------------------------------------------------------------
 
 
@@ -562,6 +635,7 @@ def _sphere(gavel: _Judge, t: _Subject) -> None:
     what = "total variation of p_theta to the exact sphere"
     gavel.near("PHYSICS_SPHERE_P_THETA", "/optics/fresnel", what, variation, 0.0, allowed, hint)
     _sphere_conditionals(gavel, t, fresnel, truth)
+    _sphere_memory(gavel, t)
     if abs(t.eta - ZHOU_ETA) < ROUNDING:
         _zhou(gavel, t)
 
