@@ -50,6 +50,9 @@ def test_info_json_says_what_the_header_says():
     for name in ("table_error", "factorisation_error", "energy_ledger", "fits"):
         assert set(facts[name]) == set(table.header[name])
     assert (facts["joint_records"], facts["paths"], facts["absorption"]) == (8, 1 << 17, 0.0)
+    assert (facts["memory_records"], facts["format_version"]) == (0, "1.0")
+    facts = json.loads(run(info, CUBE.replace("cube.tsdf", "cube_memory.tsdf"), "--json").stdout)
+    assert (facts["memory_records"], facts["joint_records"], facts["format_version"]) == (32, 0, "1.1")
 
 
 def test_info_for_people():

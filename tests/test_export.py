@@ -445,6 +445,17 @@ def test_npz_is_the_table(cube: Table, tmp_path: Path) -> None:
         assert json.loads(str(found["medium"]))["sigma_t"][0] == pytest.approx(expected(cube, (0.0,))[0][0], rel=1e-12)
 
 
+def test_npz_holds_the_records_by_entry(tmp_path: Path) -> None:
+    path = CUBE.with_name("cube_memory.tsdf.exr")
+    table = tsdf.read(path)
+    result = run("--to", "npz", "--packing", 0.6, "--radius", 0.5, "--out", tmp_path / "a.npz", file=path)
+    assert (result.exit_code, result.output) == (0, "")
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as found:
+        assert np.array_equal(found["memory_hit"][0], table.hit.astype(np.float32))
+        for name, values in table.memory.items():
+            assert np.array_equal(found[f"memory_{name}"], values)
+
+
 # -------------------------------------------------------------------------------------------- bad input
 
 

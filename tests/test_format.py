@@ -21,7 +21,7 @@ from tsdf import container
 from tsdf import format as fmt
 from tsdf.errors import FormatError, FormatWarning, TSDFError
 from tsdf.reference_data import make_golden
-from tsdf.table import Table, thawed
+from tsdf.table import MEMORY_FIELDS, Table, thawed
 
 ROOT = Path(__file__).parents[1]
 GOLDEN = ROOT / "reference_data" / "golden"
@@ -304,6 +304,48 @@ def test_a_disk_that_loses_what_is_written_last(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(os, "fsync", lambda number: os.ftruncate(number, 1000))
     with pytest.raises(TSDFError, match="does not read back"):
         tsdf.write(table(), tmp_path / "t.tsdf.exr")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_records_by_entry() -> None:
+    """By field, and the share that meets the grain; a table without them has none."""
+    made = table("memory")
+    assert list(made.memory) == list(MEMORY_FIELDS) and made.hit.shape == (6,)
+    for field, values in made.memory.items():
+        np.testing.assert_array_equal(values, made.block(f"memory_{field}"))
+        assert values.shape == (4, 6) and not values.flags.writeable
+    assert made.header["format_version"] == "1.1" and made.hit[4] == 0.0 and made.hit[0] == 1.0
+    assert not table().memory and table().header["format_version"] == "1.0"
+
+
+def test_the_exit_follows_from_a_record() -> None:
+    """Section 5 of SPEC.md by hand: entry, exit and direction of all records are unit vectors of one path.
+
+    Before the division the exit is off the sphere by what float32 loses; after it by the rounding of a double.
+    """
+    made = fmt.read(GOLDEN / "checks" / "cube_memory.tsdf.exr")
+    memory = {field: values[:, made.hit > 0.0].astype(np.float64) for field, values in made.memory.items()}
+    b, a, cosine = np.sqrt(memory["entry_b2"]), memory["entry_azimuth"], memory["cos_theta"]
+    sine = np.sqrt(1.0 - cosine**2)
+    n_i = np.array((b, 0.0 * b, -np.sqrt(1.0 - memory["entry_b2"])))
+    phi_p = a + memory["phi_delta"]
+    reached = n_i + np.array((memory["r"] * np.cos(phi_p), memory["r"] * np.sin(phi_p), memory["z"]))
+    size = np.sqrt((reached**2).sum(axis=0))
+    assert 1e-9 < np.abs(size - 1.0).max() < fmt.SPHERE_TOLERANCE
+    n_o, d_out = reached / size, np.array((sine * np.cos(a), sine * np.sin(a), cosine))
+    assert np.abs((n_o**2).sum(axis=0) - 1.0).max() < 1e-15 * 4
+    assert (n_o * d_out).sum(axis=0).min() > -1e-3  # light leaves outwards, as it came in
+    assert n_i[2].max() <= 0.0
+
+
+def test_which_version_a_file_states(tmp_path: Path) -> None:
+    """1.1 without anything new in it can be read, but is not written; nor is anything new as 1.0."""
+    header, pixels = make_golden.table(make_golden.WEIGHTS)
+    assert codes(make_golden.file({**header, "format_version": "1.1"}, pixels)) == []
+    for name, version in (("records", "1.1"), ("memory", "1.0"), ("memory", "1.2")):
+        header = {**thawed(table(name).header), "format_version": version}
+        with pytest.raises(TSDFError, match="that of its blocks is"):
+            tsdf.write(Table(header, table(name).pixels), tmp_path / "t.tsdf.exr")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -70,7 +70,7 @@ def llvm():
 @pytest.fixture(scope="module")
 def ball():
     """Return the table of the exact sphere."""
-    return scatterometer.exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=128, joint=0))
+    return scatterometer.exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=128, joint=0, memory=2))
 
 
 @pytest.fixture(scope="module")
