@@ -40,7 +40,7 @@ def fcc(fraction: float, noise: float) -> tuple[np.ndarray, float]:
 # ------------------------------------------------------------------------------------------ the packing
 
 
-@pytest.mark.parametrize("fraction", [1e-4, 0.2, 0.5, MAX])
+@pytest.mark.parametrize("fraction", [1e-4, 0.2, 0.5, 0.625, MAX])
 def test_spheres_do_not_overlap(fraction: float) -> None:
     """All pairs with all images by plain arithmetic; the fraction is the one asked for, the bytes are repeated."""
     packing = pack(fraction, 200, seed=3, cache=False)
@@ -54,7 +54,7 @@ def test_spheres_do_not_overlap(fraction: float) -> None:
         distance = np.linalg.norm(centres[:, None] - centres[None] + side * np.array(tile), axis=2)
         least = min(least, distance[distance > 0.0].min())
     assert least >= 2.0 - 1e-9
-    if fraction == 0.2:
+    if fraction in (0.2, MAX):
         assert pack(fraction, 200, seed=3, cache=False).centres.tobytes() == centres.tobytes()
         assert pack(fraction, 200, seed=4, cache=False).centres.tobytes() != centres.tobytes()
 
@@ -177,6 +177,26 @@ def test_dense_packing_is_no_crystal(packings: dict[float, Packing]) -> None:
         return float(count[1] / (count[0] + count[2]))
 
     assert second_shell(glass.centres, glass.side) < 1.2 < second_shell(crystal, side)
+
+
+@pytest.mark.parametrize(("spheres", "seed"), [(64, 0), (64, 1), (300, 2)])
+def test_densest_packing_is_made_of_any_number(spheres: int, seed: int) -> None:
+    """At MAX, where random starts jam, fluids are compressed; some starts of few spheres jam, and others follow."""
+    packing = pack(MAX, spheres, seed, cache=False)
+    assert module.closest(packing.centres, packing.side) >= 2.0 - 1e-9
+    assert packing.fraction == pytest.approx(MAX, rel=1e-12)
+
+
+def test_densest_packing_is_no_crystal(packings: dict[float, Packing]) -> None:
+    """Nor is the compressed fluid at 0.64, by the same measures, whose controls are those of the test above.
+
+    Pairs up to 2.2 R apart are more than at 0.6, by less than a fifth: the same neighbours, closer together.
+    """
+    packing = pack(MAX, 500, cache=False)
+    q6, solid, stretch = order(packing.centres, packing.side)
+    assert q6 < 5.0 and solid < 0.05 and stretch < 4.0
+    share = [2.0 * len(pairs(p.centres, p.side, 2.2)[0]) / len(p.centres) for p in (packings[0.6], packing)]
+    assert 1.0 < share[1] / share[0] < 1.2
 
 
 # ------------------------------------------------------------------------------------------ lines
@@ -374,7 +394,7 @@ def test_place_of_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         assert module._folder() == tmp_path / folder
 
 
-@pytest.mark.parametrize("fraction", [0.0, -0.1, 0.64, 1.0, math.nan, math.inf])
+@pytest.mark.parametrize("fraction", [0.0, -0.1, 0.6401, 1.0, math.nan, math.inf])
 def test_impossible_fractions_are_refused(fraction: float) -> None:
     with pytest.raises(UsageError, match="packing fraction must be above 0 and at most"):
         pack(fraction)

@@ -4,12 +4,14 @@ The truth that models of granular media are measured against; what stands in the
 not here. Lengths are in units of the spheres' radius. Tile (0, 0, 0) is the cube [0, side)^3 and tiles repeat for ever.
 A packing is relaxed from random points (soft spheres, FIRE), then moved by the hard-sphere Monte Carlo method of
 Metropolis et al. 1953: up to the freezing point (0.494) the equilibrium fluid, above it a glass, for the run is too
-short for crystals to grow.
+short for crystals to grow. Above 0.625, where random starts jam, a dense fluid is compressed in small steps, moved
+after each: it jams later, the slower the later.
 """
 
 import math
 import os
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,14 +23,18 @@ from tsdf.files import replacing
 from tsdf.sampling import key_of, mix, unit
 from tsdf.vectors import KERNEL
 
-MAX = 0.625  # volume fraction; random starts jam at about 0.64 (O'Hern et al. 2003)
+MAX = 0.64  # volume fraction; compressed fluids jam at about 0.65
 MIN_SPHERES = 64  # the cube is then at least six radii wide: no sphere meets a neighbour twice
 CLOSEST = 2.0 - 1e-9  # centres of two spheres are nowhere closer [R]
 
 _VERSION = 1  # of the algorithm; a change that moves a sphere changes it
 _RELAXED = 0.62  # volume fraction to which larger spheres are relaxed, so that there is room when they have their size
 _SLACK = 5e-4  # overlap of larger spheres that does not matter [diameter]
-_ATTEMPTS = 20  # at MAX one in two starts of 64 spheres is jammed; of 300 and more none was
+_RANDOM = 0.625  # volume fraction up to which packings are made of random starts; they jam at 0.64 (O'Hern et al. 2003)
+_FLUID, _STIRRED = 0.58, 6_000  # volume fraction and sweeps of the fluid that is compressed to more than that
+_STEP, _BETWEEN = 0.005, 1_500  # steps of its compression in volume fraction, and sweeps after each
+_CLEAR = 1e-4  # overlap of larger spheres that does not matter, while it is compressed [diameter]
+_ATTEMPTS = 20  # at MAX two in three starts of 64 spheres are jammed and one in three of 300; of 1000 and more none was
 _STEPS = 10_000  # of one relaxation
 _SWEEPS = 4_000
 _PAD = 1e-3  # cells list spheres that come this close, far more than the rounding of the walk through them
@@ -258,7 +264,7 @@ def pack(fraction: float, spheres: int = 2000, seed: int = 0, cache: bool = True
     """
     if not (0.0 < fraction <= MAX):
         raise UsageError(
-            f"the packing fraction must be above 0 and at most {MAX}, where random spheres jam, got {fraction}"
+            f"the packing fraction must be above 0 and at most {MAX}, near where random spheres jam, got {fraction}"
         )
     if not (spheres >= MIN_SPHERES and spheres % 1 == 0):
         raise UsageError(f"a packing needs a whole number of spheres, {MIN_SPHERES} or more, got {spheres}")
@@ -276,18 +282,46 @@ def pack(fraction: float, spheres: int = 2000, seed: int = 0, cache: bool = True
 
 
 def _made(fraction: float, spheres: int, seed: int, side: float) -> np.ndarray:
-    diameter = 2.0 * max(min(1.2, _RELAXED / fraction) ** (1.0 / 3.0), 1.0 + _SLACK)
-    enough = max(2.0, diameter * (1.0 - _SLACK))
     for attempt in range(_ATTEMPTS):
         key = np.uint64(key_of(np.uint64(seed), attempt, spheres))
-        centres = side * np.random.Generator(np.random.PCG64(int(key))).random((spheres, 3))
-        if _relax(centres, side, _grid(2.0 * side / diameter, spheres), diameter, enough, _STEPS):
-            _stir(centres, side, _grid(side, spheres), key, _SWEEPS)
+        if fraction <= _RANDOM:
+            centres = _quenched(fraction, spheres, key, side)
+        else:
+            centres = _compressed(fraction, spheres, key, side)
+        if centres is not None:
             return centres
     raise TSDFError(
         f"{spheres} spheres could not be packed to a fraction of {fraction}; "
         "take more spheres, another seed or a smaller fraction"
     )
+
+
+def _quenched(fraction: float, spheres: int, key: np.uint64, side: float, sweeps: int = _SWEEPS) -> np.ndarray | None:
+    """Return the centres of spheres pushed apart from random points and moved, None if they jammed."""
+    diameter = 2.0 * max(min(1.2, _RELAXED / fraction) ** (1.0 / 3.0), 1.0 + _SLACK)
+    enough = max(2.0, diameter * (1.0 - _SLACK))
+    centres = side * np.random.Generator(np.random.PCG64(int(key))).random((spheres, 3))
+    if not _relax(centres, side, _grid(2.0 * side / diameter, spheres), diameter, enough, _STEPS):
+        return None
+    _stir(centres, side, _grid(side, spheres), key, sweeps)
+    return centres
+
+
+def _compressed(fraction: float, spheres: int, key: np.uint64, side: float) -> np.ndarray | None:
+    """Return the centres of a fluid compressed in small steps, pushed apart and moved at each, None if it jammed."""
+    diameter = 2.0 * (1.0 + _CLEAR)
+    steps = math.ceil((fraction - _FLUID) / _STEP)
+    sides = [side * (fraction / (_FLUID + (fraction - _FLUID) * k / steps)) ** (1.0 / 3.0) for k in range(steps)]
+    centres = _quenched(_FLUID, spheres, key, sides[0], _STIRRED)
+    for step, (old, new) in enumerate(pairwise([*sides, side])):
+        if centres is None:
+            return None
+        centres *= new / old
+        centres[centres >= new] = 0.0
+        if not _relax(centres, new, _grid(2.0 * new / diameter, spheres), diameter, 2.0, _STEPS):
+            return None
+        _stir(centres, new, _grid(new, spheres), np.uint64(key_of(key, step, 1)), _BETWEEN)
+    return centres
 
 
 # ------------------------------------------------------------------------------------------ keeping
