@@ -34,7 +34,7 @@ LAYERS = [
         "medium",
         "packing",
     },
-    {"grains", "format", "estimate", "horizon", "sampler", "scene"},
+    {"grains", "format", "estimate", "horizon", "neighbours", "sampler", "scene"},
     {"tracer", "exact", "geometry"},
     {"scatterometer", "validate", "plots", "explicit"},
     {"transport"},
@@ -108,7 +108,9 @@ def test_library_does_not_import_the_command_line() -> None:
         assert not any(name.startswith(("click", "tsdf.cli")) for name, _ in imports(path)), path
 
 
-@pytest.mark.parametrize("command", ["build", "compare", "export", "info", "merge", "plot", "render", "validate"])
+@pytest.mark.parametrize(
+    "command", ["build", "compare", "export", "info", "merge", "packing", "plot", "render", "validate"]
+)
 def test_help_loads_nothing_slow(command: str) -> None:
     """``--help`` is instant because no array library is loaded for it."""
     code = (
