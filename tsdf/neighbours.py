@@ -25,7 +25,7 @@ from tsdf.container import Broken, Format
 from tsdf.errors import UsageError
 from tsdf.estimate import software
 from tsdf.packing import MAX, Packing, cells_of, next_sphere, pack
-from tsdf.sampling import key_of, mix, unit
+from tsdf.sampling import SOBOL, key_of, mix, sobol, unit
 from tsdf.table import frozen, thawed
 from tsdf.vectors import cross, dot, step
 
@@ -252,8 +252,8 @@ def spread(law: Law, eta: float = 1.31) -> float:
 
 def _stationary(here: np.ndarray, there: np.ndarray, cells: int, k: int) -> np.ndarray:
     """Return how often each cell is left through in the long run, (cells,), sum 1."""
-    passing = np.bincount(there * cells + here, np.full(len(here), 1.0 / k), cells * cells).reshape(cells, cells)
-    passing -= np.eye(cells)
+    share = np.bincount(there * cells + here, np.full(len(here), 1.0 / k), cells * cells)
+    passing = share.reshape(cells, cells) - np.eye(cells)
     passing[-1] = 1.0
     return np.linalg.solve(passing, np.eye(cells)[-1])
 
@@ -388,14 +388,22 @@ def _even(values: np.ndarray) -> np.ndarray:
     return ((rank + 0.5) / values.size).reshape(values.shape)
 
 
+@njit(cache=True)
+def _points(n):
+    """Return n points of the unit cube, (n, 3) float64."""
+    u = np.empty((n, 3))
+    for i in range(n):
+        for axis in range(3):
+            u[i, axis] = sobol(i, axis, np.uint32(key_of(0, axis, 0) >> np.uint64(32)), SOBOL)
+    return u
+
+
 def thin(cells: int, k: int) -> Law:
     """Return the law of the thinnest packings, its mean gap 1: a gap is exponential, the rest even, all independent.
 
-    The records are consecutive points of an additive recurrence (Roberts 2018), so each cell and all of them are even.
+    The records are consecutive points of a scrambled Sobol' sequence, so each cell and all of them are even.
     """
-    g = 1.2207440846057596  # root of x^4 = x + 1
-    n = np.arange(cells * k)[:, None] + 1.0
-    u = (0.5 + n * np.array([1.0 / g, 1.0 / g**2, 1.0 / g**3])) % 1.0
+    u = _points(cells * k)
     order = np.lexsort((u[:, 0], np.repeat(np.arange(cells), k)))
     gap, entry, azimuth = u[order].T.reshape(3, cells, k)
     gap = -np.log1p(-gap)
@@ -494,17 +502,26 @@ def _tabulated(
         samples, each = zip(*pool.map(one, range(packings)), strict=True)
     records = Records(*map(np.concatenate, zip(*samples, strict=True)))
     gap, entry_b2, azimuth = reduce(records, cells, k, seed)
-    gap = _rounded(gap * (mean_gap(f) / gap.mean()))
-    kept = Law(gap, entry_b2, np.minimum(_rounded(azimuth), math.pi))
+    gap *= mean_gap(f) / gap.mean()
+    kept = Law(_rounded_gaps(gap), entry_b2, np.minimum(_rounded(azimuth, _BITS), math.pi))
     errors = {name: float(np.std([one[name] for one in each], ddof=1) / math.sqrt(packings)) for name in each[0]}
     entry = {"statistics": measured(records, f), "standard_errors": errors, "table_displacement": spread(kept)}
     return entry, np.concatenate([block.T for block in kept]).astype(np.float32)
 
 
-def _rounded(values: np.ndarray) -> np.ndarray:
+def _rounded(values: np.ndarray, bits: int) -> np.ndarray:
     """Return numbers rounded to a few significant bits, which a file holds in less room."""
     mantissa, exponent = np.frexp(values)
-    return np.ldexp(np.round(np.ldexp(mantissa, _BITS)), exponent - _BITS)
+    return np.ldexp(np.round(np.ldexp(mantissa, bits)), exponent - bits)
+
+
+def _rounded_gaps(gap: np.ndarray) -> np.ndarray:
+    """Return gaps with no more bits than their mean needs: of few records it is off by more than of many."""
+    for bits in range(_BITS, 24):
+        rounded = _rounded(gap, bits)
+        if abs(rounded.mean() / gap.mean() - 1.0) < 0.5 * GAP_TOLERANCE:
+            return rounded
+    return gap
 
 
 # ------------------------------------------------------------------------------------------ the file
