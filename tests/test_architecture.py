@@ -33,6 +33,7 @@ LAYERS = [
         "lights",
         "medium",
         "packing",
+        "room",
     },
     {"grains", "format", "estimate", "horizon", "neighbours", "sampler", "scene"},
     {"tracer", "exact", "geometry"},
@@ -40,7 +41,8 @@ LAYERS = [
     {"transport"},
     {"world"},
     {"render"},
-    {"compare"},
+    {"experiment"},
+    {"accuracy", "compare"},
 ]
 DOORS = {
     "trimesh": {"grains"},
@@ -109,7 +111,7 @@ def test_library_does_not_import_the_command_line() -> None:
 
 
 @pytest.mark.parametrize(
-    "command", ["build", "compare", "export", "info", "merge", "packing", "plot", "render", "validate"]
+    "command", ["accuracy", "build", "compare", "export", "info", "merge", "packing", "plot", "render", "validate"]
 )
 def test_help_loads_nothing_slow(command: str) -> None:
     """``--help`` is instant because no array library is loaded for it."""

@@ -31,6 +31,19 @@ STYLE: Any = {
     "mathtext.fontset": "dejavusans",
     "svg.hashsalt": "tsdf",
 }
+COLOURS = {  # of levels, to be told apart by all eyes (Okabe & Ito 2008)
+    "explicit": "#000000",
+    "teleport-memory": "#0072b2",
+    "teleport-joint": "#009e73",
+    "teleport": "#d55e00",
+    "volume": "#e69f00",
+    "volume-hg": "#cc79a7",
+    "isotropic": "#56b4e9",
+}
+MARKS = {"explicit": "s", "teleport-memory": "o", "teleport-joint": "^", "teleport": "v", "volume": "D"}
+ANGLE_STYLES: Any = (("-", "full"), ("--", "none"))  # of lines and marks, by angle
+BAND = 0.18  # opacity of an error's band
+LINEAR = 1.0  # [%] deviations up to which an axis is linear, beyond it is logarithmic
 
 
 def check_suffix(path: str | os.PathLike[str]) -> str:
@@ -139,11 +152,11 @@ def plot_levels(rows: Sequence[Mapping[str, Any]], reference: str, title: str) -
         shown = [100.0 * row["rmse"] for row in points]
         floor = 0.3 * min(shown, default=1.0)
         words = []
-        for k, (row, error) in enumerate(zip(points, shown, strict=True)):
+        for row, error in zip(points, shown, strict=True):
             time = row["seconds_to_1_percent"]
-            style: Any = {"color": f"C{k}", "markersize": 6}
+            style: Any = {"color": COLOURS[row["level"]], "markersize": 6}
             if row is rows[0]:
-                axes.axhline(error, color="C0", linestyle=":", linewidth=1.0)
+                axes.axhline(error, color=COLOURS[row["level"]], linestyle=":", linewidth=1.0)
                 axes.plot(time, error, "s", **style)
                 word = f"{row['level']} (its noise)"
             elif row["rmse_seen"]:
@@ -164,7 +177,8 @@ def plot_levels(rows: Sequence[Mapping[str, Any]], reference: str, title: str) -
                 height = max(math.log(shown[k] / floor) / math.log(top / floor), height + 0.055)
                 axes.annotate(
                     _literal(words[k]), (times[k], shown[k]), (1.04, height), "data", "axes fraction", va="center",
-                    color=f"C{k}", arrowprops={"arrowstyle": "-", "color": f"C{k}", "linewidth": 0.4},
+                    color=COLOURS[points[k]["level"]],
+                    arrowprops={"arrowstyle": "-", "color": COLOURS[points[k]["level"]], "linewidth": 0.4},
                 )  # fmt: skip
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter("{x:g}")
@@ -174,6 +188,139 @@ def plot_levels(rows: Sequence[Mapping[str, Any]], reference: str, title: str) -
         axes.set_ylabel(f"error of the model: RMSE to {reference}, noise taken off [%]")
         axes.set_title(_literal(title))
     return figure
+
+
+def plot_accuracy(rows: Sequence[Mapping[str, Any]], fraction: float, title: str) -> Any:
+    """Return a matplotlib Figure of how far levels are from packed grains: in the bulk, in slabs, and against time.
+
+    Parameters
+    ----------
+    rows : sequence of dict
+        As of `accuracy.facts`.
+    fraction : float
+        Packing fraction of the slabs and times that are shown [1].
+    title : str
+    """
+    import matplotlib
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(10.0, 3.9), layout="constrained")
+        left, middle, right = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 0.9))
+        bulk = [row for row in rows if row["quantity"] == "displacement"]
+        _deviations(left, bulk, "fraction", {None: ("-", "full")})
+        left.set_title("bulk: mean squared displacement per event")
+        left.set_xlabel("packing fraction")
+        left.set_ylabel("deviation from explicit [%]")
+        left.set_xticks(sorted({row["fraction"] for row in bulk}))
+        left.xaxis.set_major_formatter("{x:g}")
+        slabs = [row for row in rows if row["quantity"] == "reflectance" and row["fraction"] == fraction]
+        clear = [row for row in slabs if row["albedo"] == 1.0]
+        angles = sorted({row["angle_deg"] for row in clear})
+        _deviations(middle, clear, "layer", dict(zip(angles, ANGLE_STYLES, strict=False)))
+        layers = sorted({row["layer"] for row in clear})
+        middle.set_xscale("log")
+        middle.set_xticks(layers, [f"{layer:g}" for layer in layers])
+        middle.set_xticks([], minor=True)
+        middle.set_title(f"reflectance of slabs, packing fraction {fraction:g}")
+        middle.set_xlabel("thickness of the layer of centres [R]")
+        _against_time(right, slabs, [row for row in rows if row["quantity"] == "time"])
+        right.set_title("cost, and the worst of these slabs")
+
+        levels = [level for level in COLOURS if any(row["level"] == level for row in rows)]
+        style: Any = {"markersize": 4.5}
+        keys: list[Any] = [
+            Line2D([], [], color=COLOURS[level], marker=MARKS.get(level, "o"), label=level, **style)
+            for level in levels if level != "explicit"
+        ]  # fmt: skip
+        keys.append(Patch(color=COLOURS["explicit"], alpha=BAND, linewidth=0, label="error of explicit"))
+        keys += [
+            Line2D([], [], color="0.4", linestyle=line, marker="o", fillstyle=fill, label=f"at {angle:g}°", **style)
+            for angle, (line, fill) in zip(angles, ANGLE_STYLES, strict=False)
+        ]
+        figure.suptitle(f"{_literal(title)}: levels against packed grains, traced one by one", fontsize=10.5)
+        figure.legend(handles=keys, loc="outside lower center", ncols=len(keys), frameon=False, handlelength=1.8)
+    return figure
+
+
+def _deviations(axes: Any, rows: Sequence[Mapping[str, Any]], over: str, styles: Mapping[Any, tuple[str, str]]) -> None:
+    """Draw deviations from explicit [%] over a key of the rows, by level and, where `styles` has several, by angle; the
+    band is explicit's own error, the widest of them."""
+    own: dict[float, float] = {}
+    for row in rows:
+        if row["level"] == "explicit" and row["value"] > 0.0:
+            own[row[over]] = max(own.get(row[over], 0.0), 100.0 * row["error"] / row["value"])
+    places = sorted(own)
+    band = np.array([own[place] for place in places])
+    axes.fill_between(places, -band, band, color=COLOURS["explicit"], alpha=BAND, linewidth=0)
+    axes.axhline(0.0, color=COLOURS["explicit"], linewidth=0.8)
+    axes.set_yscale("symlog", linthresh=LINEAR, linscale=0.8)
+    shown = [3.0 * LINEAR]
+    for level, colour in COLOURS.items():
+        for angle, (line, fill) in styles.items():
+            some = sorted(
+                (row for row in rows if row["level"] == level and (angle is None or row["angle_deg"] == angle)
+                 and row["deviation"] == row["deviation"]), key=lambda row: row[over],
+            )  # fmt: skip
+            values = [100.0 * row["deviation"] for row in some]
+            errors = [100.0 * row["error"] / row["value"] for row in some]
+            axes.errorbar(
+                [row[over] for row in some], values, errors, color=colour, linestyle=line, linewidth=1.2,
+                marker=MARKS.get(level, "o"), markersize=4.5, fillstyle=fill, capsize=2, elinewidth=0.8,
+            )  # fmt: skip
+            shown += [abs(value) + error for value, error in zip(values, errors, strict=True)]
+    _percent_ticks(axes.yaxis, 1.25 * max(shown))
+    axes.set_ylim(-1.25 * max(shown), 1.25 * max(shown))
+    axes.grid(linewidth=0.3, alpha=0.5)
+
+
+def _percent_ticks(axis: Any, most: float) -> None:
+    """Mark 0, half and all of where the axis is linear, and 1 and 3 of each decade beyond."""
+    steps = [0.5 * LINEAR, *(LINEAR * a * 10.0**k for k in range(6) for a in (1.0, 3.0))]
+    steps = [step for step in steps if step <= most]
+    axis.set_ticks([-step for step in reversed(steps)] + [0.0] + steps)
+    axis.set_ticks([], minor=True)
+    axis.set_major_formatter(lambda value, _: "0" if value == 0.0 else f"{value:+g}")
+
+
+def _against_time(axes: Any, slabs: Sequence[Mapping[str, Any]], times: Sequence[Mapping[str, Any]]) -> None:
+    """Draw the largest deviation of slabs, its error taken off, over the time per event."""
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    points: list[tuple[str, float, float, float]] = []
+    for row in times:
+        own = [one for one in slabs if one["level"] == row["level"]]
+        far = [one for one in own if one["deviation"] == one["deviation"]]
+        if row["level"] == "explicit" and own:
+            points.append((row["level"], row["value"], 0.0, max(100.0 * one["error"] / one["value"] for one in own)))
+        elif far:
+            most = max(far, key=lambda one: abs(one["deviation"]) - one["deviation_error"])
+            points.append((row["level"], row["value"], 100.0 * abs(most["deviation"]), 100.0 * most["deviation_error"]))
+    floor, top = 0.1, 10.0
+    for level, time, worst, error in points:
+        style: Any = {"color": COLOURS[level], "markersize": 6, "capsize": 3, "elinewidth": 0.9}
+        if level == "explicit":
+            axes.errorbar(time, error, 0.3 * error, fmt="_", uplims=True, **style)
+            axes.annotate("explicit,\nits error", (time, error), (6.0, 4.0), "data", "offset points", ha="right")
+            worst = error
+        else:
+            down = worst - max(worst - error, 0.5 * floor)
+            axes.errorbar(time, worst, [[down], [error]], fmt=MARKS.get(level, "o"), **style)
+        top, floor = max(top, 1.5 * (worst + error)), min(floor, worst / 2.0)
+    if points:
+        spread = [time for _, time, _, _ in points]
+        axes.set_xlim(min(spread) / 1.5, max(spread) * 1.8)
+        axes.set_ylim(floor, top)
+    for axis, steps in ((axes.xaxis, (1.0, 2.0, 5.0)), (axes.yaxis, (1.0, 3.0))):
+        low, high = axis.get_view_interval()
+        axis.set_ticks([a * 10.0**k for k in range(-4, 5) for a in steps if low <= a * 10.0**k <= high])
+        axis.set_ticks([], minor=True)
+        axis.set_major_formatter("{x:g}")
+    axes.grid(linewidth=0.3, alpha=0.5)
+    axes.set_xlabel("time per event, over that of teleport")
+    axes.set_ylabel("largest deviation of reflectance [%]")
 
 
 def _title(table: Table) -> str:

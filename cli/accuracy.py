@@ -1,0 +1,108 @@
+"""``tsdf-accuracy``: a table in, the error of every level in bulk and in slabs out."""
+
+import signal
+from pathlib import Path
+
+import click
+
+from tsdf.cli.common import Tool, plain
+from tsdf.cli.render import LEVELS
+
+MEASURED = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume")
+
+
+@click.command("tsdf-accuracy", cls=Tool)
+@click.argument("table", type=click.Path(path_type=Path))
+@click.option(
+    "--out", required=True, type=click.Path(path_type=Path), metavar="FOLDER",
+    help="Folder to write to: accuracy.csv, accuracy.md, accuracy.png.",
+)  # fmt: skip
+@click.option(
+    "--packing", type=float, multiple=True, metavar="F", default=(0.1, 0.3, 0.5, 0.6, 0.64), show_default=True,
+    help="Packing fraction; may be given several times.",
+)  # fmt: skip
+@click.option(
+    "--layer", type=float, multiple=True, metavar="T", default=(2.0, 4.0, 10.0, 40.0), show_default=True,
+    help="Thickness of the layer of centres of a slab's grains [R]; may be given several times.",
+)  # fmt: skip
+@click.option("--levels", metavar="A,B,..", help=f"Levels to measure.  [default: {','.join(MEASURED)}]")
+@click.option("--mesh", type=click.Path(path_type=Path), metavar="FILE", help="Of a grain that is not built in.")
+@click.option(
+    "--seconds", type=float, metavar="S",
+    help="About the time of it all, but for packings that have to be made first.  [default: 300]",
+)  # fmt: skip
+@click.option("--paths", type=int, metavar="N", help="Paths of each slab, level and packing instead.")
+@click.option("--packings", type=int, default=4, metavar="K", show_default=True, help="Packings behind explicit.")
+@click.option("--seed", type=int, default=0, metavar="N", show_default=True, help="Of the random numbers, >= 0.")
+@click.option("--threads", type=int, metavar="N", help="[default: all processors]")
+@click.option("--quiet", is_flag=True, help="No progress bar, no table.")
+def main(
+    table: Path, out: Path, packing: tuple[float, ...], layer: tuple[float, ...], levels: str | None,
+    mesh: Path | None, seconds: float | None, paths: int | None, packings: int, seed: int, threads: int | None,
+    quiet: bool,
+) -> int:  # fmt: skip
+    """Measure the levels that render the grain of TABLE against tracing packed grains one by one.
+
+    In the bulk: mean squared displacement per event. In slabs: light that comes back and passes, at two angles, of
+    lossless grains and of albedo 0.99. A level that is impossible is skipped with a word. Ctrl-C keeps what is done.
+    With --paths the same command gives the same numbers, but for times. Exit status 130 if interrupted, 1 if the table
+    cannot be measured, 2 if the request cannot be meant.
+    """
+    from difflib import get_close_matches
+
+    from tsdf.errors import SceneError, TSDFError, UsageError
+
+    chosen = [name.strip() for name in levels.split(",")] if levels is not None else list(MEASURED)
+    for name in chosen:
+        if name not in LEVELS:
+            near = get_close_matches(name, LEVELS, 1)
+            hint = f"did you mean {near[0]}?" if near else f"levels are {', '.join(LEVELS)}"
+            raise UsageError(f"--levels: no level {name!r}; {hint}")
+    if threads is not None and threads < 1:
+        raise UsageError(f"--threads is a whole number of at least 1, not {threads}")
+    if not 0 <= seed < 2**63:
+        raise UsageError(f"--seed is a whole number from 0 to 2^63 - 1, not {seed}")
+
+    from tqdm import tqdm
+
+    from tsdf import accuracy, format, plots
+    from tsdf.files import replacing
+    from tsdf.scene import GrainSpec
+
+    read = format.read(table)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TSDFError(f"--out {plain(out)}: cannot be made: {error.strerror}; give a folder") from None
+
+    def stop(*_: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # signals come twice, and the second is no other
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    form = "{percentage:3.0f}% |{bar}| {postfix} [{elapsed}]"
+    try:
+        with tqdm(total=1.0, disable=quiet or None, bar_format=form, dynamic_ncols=True) as bar:
+
+            def progress(share: float, word: str) -> None:
+                bar.set_postfix_str(word, refresh=False)
+                bar.update(share - bar.n)
+
+            found = accuracy.measure(
+                GrainSpec(read, mesh=mesh), packing, layer, chosen, packings, seconds, paths, seed, threads, progress,
+                plain(table.name),
+            )  # fmt: skip
+    except SceneError as error:
+        raise TSDFError(f"{error} (--mesh FILE)" if mesh is None else str(error)) from None
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    for name, text in (("accuracy.md", accuracy.markdown(found)), ("accuracy.csv", accuracy.csv_text(found))):
+        with replacing(out / name) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    if found.rows:
+        plots.save(plots.plot_accuracy(accuracy.facts(found), found.fraction, found.name), out / "accuracy.png")
+    if not quiet:
+        click.echo(accuracy.markdown(found), nl=False)
+    if found.interrupted:
+        click.echo(f"interrupted: {plain(out)} holds what was done", err=True)
+    return 130 if found.interrupted else 0
