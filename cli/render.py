@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from tsdf.render import Picture
     from tsdf.world import World
 
-LEVELS = ("explicit", "teleport", "teleport-joint", "volume", "volume-hg", "isotropic")
+LEVELS = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume", "volume-hg", "isotropic")
 
 
 @click.command("tsdf-render", cls=Tool)

@@ -9,9 +9,10 @@ from numba import njit
 
 from tsdf import geometry, scatterometer
 from tsdf.errors import SceneError
-from tsdf.geometry import BALL, BOX, SLAB, clearance, exact_depth, exact_hit, triangle_distance
+from tsdf.geometry import clearance, exact_hit
 from tsdf.grains import load_grain
 from tsdf.optics import Optics
+from tsdf.room import BALL, BOX, SLAB, exact_depth, triangle_distance
 from tsdf.scatterometer import Effort
 from tsdf.scene import Box, Camera, ConstantLight, GrainSpec, MediumSpec, Mesh, Scene, Slab, Sphere, SurfaceSpec
 

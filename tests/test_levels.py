@@ -19,6 +19,7 @@ from tsdf.grains import load_grain
 from tsdf.medium import Component, volume_parameters
 from tsdf.optics import Optics
 from tsdf.packing import pack
+from tsdf.room import stands
 from tsdf.sampling import key_of
 from tsdf.scatterometer import Effort
 from tsdf.scene import (
@@ -466,13 +467,13 @@ def test_grains_stand_whole_inside(ball: Table, tmp_path: Path, kind: str, burie
     scene = scene_of(shape, 0.5, ball, WHITE, packing_spheres=200)
     if buried:
         scene = replace(scene, surfaces=surfaces)
-    built = place(scene)
-    arrays = explicit.packed(scene, built, [ball]).arrays
+    built = place(scene, grains=True)
+    arrays = explicit.packed(scene, [ball]).arrays
     packing = pack(0.5, 200)
     there, right = [], []
     for i, j, k in np.ndindex(5, 5, 5):
         tile = (i - 2, j - 2, k - 2)
-        there += [explicit.exists(arrays, built.arrays, 0, *tile, s) for s in range(200)]
+        there += [stands(built.room, 0, explicit.centre_of(arrays, 0, *tile, s)) for s in range(200)]
         x = packing.centres + packing.side * np.array(tile) + built.centre
         room = inside(x)
         if buried:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tsdf import geometry, image, lights, render, scatterometer, transport, world
+from tsdf import geometry, image, lights, render, scatterometer, world
 from tsdf.grains import load_grain
 from tsdf.optics import Optics
 from tsdf.render import Picture
@@ -27,12 +27,14 @@ from tsdf.scene import (
     Sphere,
     SurfaceSpec,
 )
+from tsdf.walker import MODELS
 
 ONE = (ConstantLight((1.0, 1.0, 1.0)),)
 OUTSIDE = Camera((3.0, -30.0, 7.0), (0.0, 0.0, 0.0), 16, 12, fov_deg=30.0)
 INSIDE = Camera((0.3, -0.2, 0.1), (1.0, 0.5, 0.3), 8, 6, fov_deg=100.0)
-LEVELS = tuple(transport.MODELS)
-JUMPING = ("teleport", "teleport-joint", "volume", "explicit")  # one of each way to move
+LEVELS = tuple(MODELS)
+JUMPING = ("teleport", "teleport-joint", "teleport-memory", "volume", "explicit")  # one of each way to move
+MOST = {"explicit": 0.6, "teleport-memory": 0.64}  # packing fractions of quick packings, of tabulated ones
 BOX = Box((-6.0, -5.0, -4.0), (6.0, 5.0, 4.0))
 
 # An L, extruded: a face of it sees another
@@ -68,14 +70,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def ball():
     """Return the table of the exact sphere."""
-    return scatterometer.exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=128, joint=16))
+    return scatterometer.exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=128, joint=16, memory=16))
 
 
 @pytest.fixture(scope="module")
 def cube():
     """Return the table of a traced grain."""
     shape = load_grain("cube")
-    build = scatterometer.Build.start(shape, Optics(1.5), Effort(100_000, cells=64, joint=8))
+    build = scatterometer.Build.start(shape, Optics(1.5), Effort(100_000, cells=64, joint=8, memory=32))
     build.run(shape)
     return build.table()
 
@@ -181,8 +183,8 @@ def test_furnace_notices_a_loss(folder, ball):
 @pytest.mark.parametrize("fraction", [0.05, 0.3, 0.64, 0.74])
 @pytest.mark.parametrize("level", LEVELS)
 def test_furnace_at_any_packing(fraction, level, ball):
-    """The furnace is 1 for thin and dense packings; random packings of the explicit level end at 0.64."""
-    scene = scene_of([BOX], ball, fraction=min(fraction, 0.6) if level == "explicit" else fraction)
+    """The furnace is 1 for thin and dense packings; random packings end at 0.64."""
+    scene = scene_of([BOX], ball, fraction=min(fraction, MOST.get(level, 1.0)))
     assert (take(scene, level, 2).rgb == 1.0).all()
 
 

@@ -21,7 +21,7 @@ from tsdf.render import Picture
 from tsdf.scene import LEVELS, Scene
 from tsdf.world import World, build
 
-REFERENCES = ("explicit", "teleport-joint", "teleport", "volume", "volume-hg", "isotropic")  # best first
+REFERENCES = LEVELS  # best first
 TILES = 8  # along a side of the picture, whose spread gives the error of a mean over pixels
 SEEN = 2.0  # standard errors above zero from which on a squared error counts as seen
 MOST_PACKINGS = 100

@@ -10,6 +10,7 @@ comes from the facet's plane in float64. What light does there is `transport`.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,13 +18,13 @@ from numba import njit
 
 from tsdf.errors import GrainError, SceneError
 from tsdf.grains import first_hit, grain_from_mesh, read_mesh, triangle_scene
+from tsdf.room import BALL, BOX, CLOSED, MESH, OPEN, SLAB, Room, exact_depth, room_of
 from tsdf.scene import Box, MediumSpec, Mesh, Rectangle, Scene, Slab, Sphere, SurfaceSpec
-from tsdf.vectors import KERNEL, cross, dot, step
+from tsdf.vectors import KERNEL, dot, step
 
 SLACK = 2e-6  # [of a facet's largest coordinate] a point this near to a facet is on it: 30 float32 ulps
 FIELD_CELLS = 2_000_000  # of the grid of distances: half a second to make
 LEAST_OVERLAP = 1e-3  # [of the smaller extent] media that overlap by less only touch
-MESH, SLAB, BOX, BALL = 0, 1, 2, 3  # kinds of boundaries
 NONE = -1
 
 
@@ -131,18 +132,6 @@ def ball_hit(balls, p, d):
 
 
 @njit(**KERNEL)
-def exact_depth(kind, shape, p):
-    """Return the distance of p to a slab's, box's or ball's boundary, positive inside; outside a box at most that."""
-    if kind == BALL:
-        q = (p[0] - shape[0], p[1] - shape[1], p[2] - shape[2])
-        return shape[3] - math.sqrt(dot(q, q))
-    depth = math.inf
-    for k in range(2 if kind == SLAB else 0, 3):
-        depth = min(depth, min(p[k] - shape[k], shape[3 + k] - p[k]))
-    return depth
-
-
-@njit(**KERNEL)
 def clearance(g, m, p):
     """Return a length within which p of medium m is sure to have neither its boundary nor a surface around it."""
     bound = math.inf
@@ -193,6 +182,8 @@ class Place:
         Of the media, relative to `centre`; None for exact shapes.
     surfaces : list of Triangles or None
         Of the surfaces, relative to `centre`; None for balls.
+    room : Room
+        Where grains stand; without facets unless asked for.
     notes : tuple of str
         What the user should know.
     """
@@ -203,6 +194,7 @@ class Place:
     centre: np.ndarray
     boundaries: list[Triangles | None]
     surfaces: list[Triangles | None]
+    room: Room
     notes: tuple[str, ...]
 
     def hits(self, starts: np.ndarray, ways: np.ndarray, out: np.ndarray) -> None:
@@ -283,8 +275,29 @@ def _extent(low: np.ndarray, high: np.ndarray, triangles: Sequence[Triangles | N
     return low, high
 
 
-def place(scene: Scene) -> Place:
+def _around(triangles: Triangles, margin: float) -> Triangles:
+    """Return a convex mesh around all that is nearer than `margin` to a mesh."""
+    from scipy.spatial import ConvexHull
+
+    corners = np.array(list(np.ndindex(2, 2, 2))) * 2.0 - 1.0
+    hull = ConvexHull((triangles.vertices[:, None] + margin * corners).reshape(-1, 3))
+    used, faces = np.unique(hull.simplices, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    points = hull.points[used]
+    normals = planes_of(points[faces])[:, :3]
+    outward = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) > 0.0
+    return Triangles(points, np.where(outward[:, None], faces, faces[:, ::-1]).astype(np.int32))
+
+
+def place(scene: Scene, grains: bool = False) -> Place:
     """Load and check the geometry of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    grains : bool
+        Whether there are single grains: the room for them is found, and media reach as far as their grains do where
+        only the centres of grains are inside the boundary.
 
     Raises
     ------
@@ -327,6 +340,8 @@ def place(scene: Scene) -> Place:
 
     media = len(scene.media)
     kind, shape, slack = np.zeros(media, np.int32), np.zeros((media, 6)), np.zeros(media)
+    radii = np.array([medium.radius for medium in scene.media])
+    whole = np.array([medium.inside == "grains" for medium in scene.media], bool)
     for i, medium in enumerate(scene.media):
         s = medium.shape
         if isinstance(s, Slab):
@@ -336,6 +351,15 @@ def place(scene: Scene) -> Place:
         elif isinstance(s, Sphere):
             kind[i], shape[i, :3], shape[i, 3] = BALL, s.centre - centre, s.radius
         slack[i] = 1e-9 * max(np.abs(shape[i]).max(), medium.radius)
+    balls = [(i, s.shape) for i, s in enumerate(scene.surfaces) if isinstance(s.shape, Sphere)]
+    places = np.array([[*(np.array(b.centre) - centre), b.radius] for _, b in balls]).reshape(-1, 4)
+    room = room_of(kind, _moved(kind, shape, np.where(whole, -radii, 0.0)), radii, whole, places,
+                   _walls(boundaries, surfaces) if grains else [])  # fmt: skip
+    if grains:
+        out = np.where(whole, 0.0, radii)
+        shape = _moved(kind, shape, out)
+        boundaries = [m and (_around(m, x) if x else m) for m, x in zip(boundaries, out.tolist(), strict=True)]
+        low, high = low - out.max(initial=0.0), high + out.max(initial=0.0)
 
     engines, first_facet, meshes, owners = [], [], [], []
     facets = 0
@@ -359,7 +383,6 @@ def place(scene: Scene) -> Place:
         first_facet.append(facets)
         facets += len(mesh.faces)
     planes, plane_slack = _planes(meshes)
-    balls = [(i, s.shape) for i, s in enumerate(scene.surfaces) if isinstance(s.shape, Sphere)]
     field, field_low, field_step, beyond = _field(meshes, low - centre, high - centre, scene)
     arrays = Geometry(
         kind=kind,
@@ -369,7 +392,7 @@ def place(scene: Scene) -> Place:
         planes=planes,
         plane_slack=plane_slack,
         surface=np.concatenate(owners).astype(np.int32) if owners else np.zeros(0, np.int32),
-        balls=np.array([[*(np.array(b.centre) - centre), b.radius] for _, b in balls]).reshape(-1, 4),
+        balls=places,
         ball_surface=np.array([i for i, _ in balls], np.int32),
         reflectance=np.array([s.reflectance for s in scene.surfaces], np.float64).reshape(-1, 3),
         field=field,
@@ -379,9 +402,46 @@ def place(scene: Scene) -> Place:
         engines=len(engines),
         solid=bool(solid),
     )
-    made = Place(arrays, engines, first_facet, centre, boundaries, surfaces, tuple(notes))
+    made = Place(arrays, engines, first_facet, centre, boundaries, surfaces, room, tuple(notes))
     _no_overlap(made, scene)
     return made
+
+
+def _moved(kind: np.ndarray, shape: np.ndarray, out: np.ndarray) -> np.ndarray:
+    """Return shapes (m, 6) whose boundaries are moved outward by (m,) [unit]."""
+    moved = shape.copy()
+    for k, by, new in zip(kind, out, moved, strict=True):
+        if k == BALL:
+            new[3] += by
+        elif k != MESH:
+            new[:3] -= by
+            new[3:] += by
+    return moved
+
+
+def _walls(
+    boundaries: Sequence[Triangles | None], surfaces: Sequence[Triangles | None]
+) -> list[tuple[int, np.ndarray, Any]]:
+    """Return owner, corners and a test for points inside of every mesh, as `room_of` takes them."""
+    walls: list[tuple[int, np.ndarray, Any]] = []
+
+    def inside(points: np.ndarray, faces: np.ndarray) -> Any:
+        return partial(within, triangle_scene(points, faces), planes_of(points[faces])[:, :3])
+
+    for m, mesh in enumerate(boundaries):
+        if mesh is not None:
+            walls.append((m, mesh.vertices[mesh.faces], inside(*mesh)))
+    for mesh in surfaces:
+        if mesh is None:
+            continue
+        try:
+            body = grain_from_mesh(mesh.vertices, mesh.faces)
+        except GrainError:
+            walls.append((OPEN, mesh.vertices[mesh.faces], None))  # it has no inside
+            continue
+        points = body.centre + body.bounding_radius * body.vertices
+        walls.append((CLOSED, points[body.faces], inside(points, body.faces)))
+    return walls
 
 
 def _planes(meshes: Sequence[Triangles]) -> tuple[np.ndarray, np.ndarray]:
@@ -464,28 +524,6 @@ def distances(corners: np.ndarray, low: np.ndarray, step: float, counts: Sequenc
         return np.full(tuple(counts), step * math.hypot(*counts), np.float32)
     bounds = distance_transform_edt(free, sampling=step) - math.sqrt(0.75) * step
     return np.maximum(bounds, 0.0).astype(np.float32)
-
-
-@njit(**KERNEL)
-def triangle_distance(corners, p):
-    """Return the distance of p to a triangle (3, 3)."""
-    a = (corners[0, 0], corners[0, 1], corners[0, 2])
-    u = (corners[1, 0] - a[0], corners[1, 1] - a[1], corners[1, 2] - a[2])
-    v = (corners[2, 0] - a[0], corners[2, 1] - a[1], corners[2, 2] - a[2])
-    q = (p[0] - a[0], p[1] - a[1], p[2] - a[2])
-    uu, uv, vv, qu, qv = dot(u, u), dot(u, v), dot(v, v), dot(q, u), dot(q, v)
-    det = uu * vv - uv * uv
-    s, t = vv * qu - uv * qv, uu * qv - uv * qu
-    n, best = cross(u, v), math.inf
-    if s >= 0.0 and t >= 0.0 and s + t <= det and det > 0.0:
-        best = dot(q, n) ** 2 / dot(n, n)  # of a needle, s and t are mostly rounding: its edges count in any case
-    for k in range(3):
-        o = a if k < 2 else step(a, 1.0, u)
-        e = u if k == 0 else (v if k == 1 else step(v, -1.0, u))
-        w = step(p, -1.0, o)
-        w = step(w, -min(max(dot(w, e) / dot(e, e), 0.0), 1.0), e)
-        best = min(best, dot(w, w))
-    return math.sqrt(best)
 
 
 def _no_overlap(made: Place, scene: Scene) -> None:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tsdf import transport as T
+from tsdf import walker as W
 from tsdf.errors import SceneError, UsageError
 from tsdf.transport import Camera
 from tsdf.world import World, camera_of, sees
@@ -79,7 +80,7 @@ class Walkers:
     def __init__(self, world: World) -> None:
         self.world = world
         engines, exemplars = len(world.place.engines), len(world.packed.engines)
-        self.walkers = [np.zeros(ROOM, T.WALKER) for _ in range(2)]
+        self.walkers = [np.zeros(ROOM, W.WALKER) for _ in range(2)]
         self.amounts = [np.zeros((ROOM, world.amounts)) for _ in range(2)]
         self.hits = np.full((engines, ROOM), -1, np.int32)
         self.grain_hits = np.full((exemplars, ROOM), -1, np.int32)
@@ -95,7 +96,6 @@ class Walkers:
 
         Once `stop` is set it is worthless.
         """
-        w = self.world
         total = pixels * spp
         radiance = np.zeros((total, 3))
         first, live = 0, 0
@@ -104,22 +104,27 @@ class Walkers:
                 fresh = min(SLOTS - live, total - first)
                 T.spawn(first, fresh, pixel, spp, sample, seed, camera, self.walkers[0][live:], self.amounts[0][live:])
                 first, live = first + fresh, live + fresh
-            T.advance(
-                live, self.walkers[0], self.amounts[0], self.walkers[1], self.amounts[1], self.hits, self.grain_hits,
-                self.starts, self.ways, self.grain_starts, self.grain_ways, w.place.arrays, w.media, w.tables, w.lights,
-                w.packed.arrays, w.absorption, radiance, self.counters, self.asked,
-            )  # fmt: skip
-            live, rays = int(self.asked[T.LIVE]), int(self.asked[T.ASKED])
-            if rays:
-                w.place.hits(self.starts[:rays], self.ways[:rays], self.hits)
-            for e, asked in enumerate(self.asked[T.GRAINS_ASKED :]):
-                if asked:
-                    self.grain_hits[e, :asked] = w.packed.hits(
-                        e, self.grain_starts[e, :asked], self.grain_ways[e, :asked]
-                    )
-            self.walkers.reverse()
-            self.amounts.reverse()
+            live = self.turn(live, radiance)
         return radiance.reshape(pixels, spp, 3)
+
+    def turn(self, live: int, radiance: np.ndarray) -> int:
+        """Take the first `live` of ``walkers[0]`` as far as they come without the ray engine, ask it, and return how
+        many go on; ``walkers[1]`` then holds what they were, those that have ended as they ended."""
+        w = self.world
+        T.advance(
+            live, self.walkers[0], self.amounts[0], self.walkers[1], self.amounts[1], self.hits, self.grain_hits,
+            self.starts, self.ways, self.grain_starts, self.grain_ways, w.place.arrays, w.place.room, w.media, w.tables,
+            w.lights, w.packed.arrays, w.memory, w.absorption, radiance, self.counters, self.asked,
+        )  # fmt: skip
+        live, rays = int(self.asked[W.LIVE]), int(self.asked[W.ASKED])
+        if rays:
+            w.place.hits(self.starts[:rays], self.ways[:rays], self.hits)
+        for e, asked in enumerate(self.asked[W.GRAINS_ASKED :]):
+            if asked:
+                self.grain_hits[e, :asked] = w.packed.hits(e, self.grain_starts[e, :asked], self.grain_ways[e, :asked])
+        self.walkers.reverse()
+        self.amounts.reverse()
+        return live
 
 
 def render(
@@ -209,8 +214,8 @@ def measure(
         counters = np.sum([walkers.counters for walkers in pool], axis=0)
         shape = (height, width, 3)
         return Picture(
-            mean.reshape(shape), variance.reshape(shape), samples.reshape(height, width), int(counters[T.EVENTS]),
-            int(counters[T.RAYS]), time.perf_counter() - begin, int(counters[T.TRUNCATED]), int(counters[T.FAULTS]),
+            mean.reshape(shape), variance.reshape(shape), samples.reshape(height, width), int(counters[W.EVENTS]),
+            int(counters[W.RAYS]), time.perf_counter() - begin, int(counters[W.TRUNCATED]), int(counters[W.FAULTS]),
             interrupted,
         )  # fmt: skip
 

@@ -26,7 +26,8 @@ from tsdf.materials import MEDIA, optical_constants
 from tsdf.medium import MAX_PACKING_FRACTION
 from tsdf.table import Table
 
-LEVELS = ("explicit", "teleport", "teleport-joint", "volume", "volume-hg", "isotropic")
+LEVELS = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume", "volume-hg", "isotropic")
+INSIDE = ("grains", "centres")
 VISIBLE_NM = (380.0, 780.0)  # [nm] what an absorption spectrum must cover
 LARGEST = 1e30  # of any number in a scene, so that squares and products stay finite
 MAX_PIXELS = 65536  # along one side of the picture
@@ -160,6 +161,7 @@ class MediumSpec:
     radius: float  # bounding radius of the grains [unit]
     grains: tuple[GrainSpec, ...]
     name: str = ""
+    inside: str = "grains"  # what lies inside the shape: bounding spheres wholly, or their centres; one of INSIDE
     packing_seed: int = 0  # of the explicit level
     packing_spheres: int = 2000  # in the periodic tile of the explicit level
 
@@ -585,6 +587,7 @@ _MEDIUM = _table(
     shape=_section(_tagged(mesh=_MESH, box=_BOX, sphere=_SPHERE, slab=_SLAB)),
     packing_fraction=_number(above=0.0, high=MAX_PACKING_FRACTION, why="equal spheres fill at most 0.7405"),
     radius=_POSITIVE,
+    inside=_choice(INSIDE),
     packing_seed=_integer(),
     packing_spheres=_integer(1),
     grain=_tables("[[medium.grain]]", _GRAIN, 1),

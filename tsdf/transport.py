@@ -14,84 +14,48 @@ matter crossed and becomes colour when light is found, for all wavelengths at on
 import math
 from typing import NamedTuple
 
-import numpy as np
 from numba import njit
 
 from tsdf import explicit as X
+from tsdf import memory as M
 from tsdf.geometry import MESH, NONE, ball_hit, clearance, exact_hit, facet_hit
 from tsdf.lights import draw as draw_light
 from tsdf.lights import radiance as light_from
 from tsdf.sampler import column_of, density, draw_column, draw_length, draw_offset, draw_record, leave, turned
 from tsdf.sampling import GOLDEN, key_of, mix, unit
 from tsdf.vectors import KERNEL, cross, dot, frame, minus, step, triple
-
-TELEPORT, TELEPORT_JOINT, VOLUME, VOLUME_HG, ISOTROPIC, EXPLICIT = range(6)
-MODELS = {
-    "teleport": TELEPORT,
-    "teleport-joint": TELEPORT_JOINT,
-    "volume": VOLUME,
-    "volume-hg": VOLUME_HG,
-    "isotropic": ISOTROPIC,
-    "explicit": EXPLICIT,
-}
-
-WALKER = np.dtype(
-    [("p", "3f8"), ("d", "3f8"), ("q", "3f8"), ("e", "3f8"), ("colour", "3f8"), ("weight", "f8"), ("luck", "f8"),
-     ("pdf", "f8"), ("free", "f8"), ("length", "f8"), ("gained", "f8"), ("skip", "f8"), ("key", "u8"), ("grain", "u8"),
-     ("events", "i8"), ("sample", "i4"), ("ray", "i4"), ("medium", "i4"), ("mode", "i4"), ("component", "i4"),
-     ("facet", "i4"), ("state", "i4"), ("tries", "i4"), ("shadow", "i4")]
+from tsdf.walker import (
+    ASKED,
+    DIM,
+    EVENTS,
+    EXPLICIT,
+    FAINT,
+    FAULTS,
+    FLY,
+    GRAIN,
+    GRAINS_ASKED,
+    GRAZING,
+    JUMP,
+    LIVE,
+    OTHER,
+    PATIENCE,
+    RAYS,
+    TELEPORT,
+    TELEPORT_JOINT,
+    TELEPORT_MEMORY,
+    TRIES,
+    TRUNCATED,
+    UNKNOWN,
+    VOLUME,
+    VOLUME_HG,
+    cast,
+    copy,
+    find,
+    halves,
+    lives,
+    renewed,
+    write,
 )  # fmt: skip
-# p, d: place and direction. q, e, length, gained: of a jump, the direction after it, its own, its length and what it
-# adds to the amounts; in a grain, q is its centre, e where the ray starts. luck: logarithm of a bound of the
-# throughput. pdf: density per steradian with which d was drawn, -1 for none. free: the free path still to fly, < 0 if
-# not drawn. skip: how far beyond p the ray engine starts. ray: row of the ray engine's answers, -1 for none.
-FLY, JUMP, GRAIN = 0, 1, 2
-UNKNOWN = -2  # medium of a walker that may have crossed a boundary
-
-EVENTS, RAYS, TRUNCATED, FAULTS = range(4)  # counters
-LIVE, ASKED, GRAINS_ASKED = range(3)  # what `advance` returns: walkers, rays to trace, then rays by exemplar
-
-OTHER = np.uint64(0xA5A5A5A5A5A5A5A5)
-LOW = np.uint64(0xFFFFFFFF)
-HALF_WORD = 1.0 / 4294967296.0
-PATIENCE = 100_000  # steps of a walker before others have their turn
-MAX_EVENTS = 50_000_000  # of one path; only light that nothing lets out comes that far, and it is counted
-DIM = math.log(0.25)  # walkers dimmer than this may end
-FAINT = 0.02  # shadows fainter than this may end
-TRIES = 8  # to start a ray off a facet, each twice as far from it
-GRAZING = 100.0  # times its thickness is the most that a point is moved off a facet along a ray
-
-
-class Media(NamedTuple):
-    """What kernels ask about media (m,) and their components (c,).
-
-    model: one of the constants above for all media; free: mean free path; reach: the longest jump; first, kinds: its
-    first component and how many it has; travel: amount that counts the length flown, or -1. Of components: choice, the
-    running sum of the probability that the next grain met is of it; scale: what one event's path length [R], or the
-    event itself where there is none, counts in the amount `slot`; slot, -1 for none; g: mean cosine of the
-    Henyey-Greenstein lobe. Lengths in scene units.
-    """
-
-    model: int
-    free: np.ndarray
-    reach: np.ndarray
-    first: np.ndarray
-    kinds: np.ndarray
-    travel: np.ndarray
-    choice: np.ndarray
-    scale: np.ndarray
-    slot: np.ndarray
-    g: np.ndarray
-
-
-class Absorption(NamedTuple):
-    """How amounts (a,) of matter become colour: exponents per wavelength (k, a) and per channel (3, a), the weight
-    (k, 3) of each wavelength in linear RGB, and the exponent of the least absorbed light (a,)."""
-
-    spectral: np.ndarray
-    rgb: np.ndarray
-    weight: np.ndarray
-    least: np.ndarray
 
 
 class Camera(NamedTuple):
@@ -105,39 +69,6 @@ class Camera(NamedTuple):
     right: tuple[float, float, float]
     down: tuple[float, float, float]
     width: int
-
-
-@njit(**KERNEL)
-def absorbed(absorption, amounts):
-    """Return the colour that the amounts of matter crossed leave of white light."""
-    if absorption.least.shape[0] == 0:
-        return 1.0, 1.0, 1.0
-    r, g, b = 0.0, 0.0, 0.0
-    if absorption.spectral.shape[0] == 0:
-        r, g, b = 1.0, 1.0, 1.0
-    for k in range(absorption.spectral.shape[0]):
-        exponent = 0.0
-        for i in range(amounts.shape[0]):
-            exponent += absorption.spectral[k, i] * amounts[i]
-        passed = math.exp(exponent)
-        r += absorption.weight[k, 0] * passed
-        g += absorption.weight[k, 1] * passed
-        b += absorption.weight[k, 2] * passed
-    er, eg, eb = 0.0, 0.0, 0.0
-    for i in range(amounts.shape[0]):
-        er += absorption.rgb[0, i] * amounts[i]
-        eg += absorption.rgb[1, i] * amounts[i]
-        eb += absorption.rgb[2, i] * amounts[i]
-    return r * math.exp(er), g * math.exp(eg), b * math.exp(eb)
-
-
-@njit(**KERNEL)
-def find(w, r, g, b, amounts, absorption, radiance):
-    """Add light found by a walker to its sample."""
-    ar, ag, ab = absorbed(absorption, amounts)
-    radiance[w.sample, 0] += w.weight * w.colour[0] * r * ar
-    radiance[w.sample, 1] += w.weight * w.colour[1] * g * ag
-    radiance[w.sample, 2] += w.weight * w.colour[2] * b * ab
 
 
 @njit(forceinline=True, **KERNEL)
@@ -163,19 +94,6 @@ def bent(d, cosine, u):
     c, s = turned(u)
     sine = math.sqrt(max(0.0, 1.0 - cosine * cosine))
     return step(step((cosine * d[0], cosine * d[1], cosine * d[2]), sine * c, a), sine * s, b)
-
-
-@njit(forceinline=True, **KERNEL)
-def renewed(d):
-    """Return a nearly unit vector with unit length: keeps rounding errors from piling up."""
-    half = 1.5 - 0.5 * dot(d, d)
-    return d[0] * half, d[1] * half, d[2] * half
-
-
-@njit(forceinline=True, **KERNEL)
-def halves(bits):
-    """Return two numbers in [0, 1) from 64 bits."""
-    return float(bits >> np.uint64(32)) * HALF_WORD, float(bits & LOW) * HALF_WORD
 
 
 @njit(forceinline=True, **KERNEL)
@@ -252,32 +170,6 @@ def connect(w, amounts, m, p, d, c, key, share, bound, media, tables, lights, sh
 
 
 @njit(**KERNEL)
-def copy(row, other):
-    """Write a row to another."""
-    for i in range(row.shape[0]):
-        row[i] = other[i]
-
-
-@njit(**KERNEL)
-def write(row, v):
-    """Write a triple to a row."""
-    row[0], row[1], row[2] = v
-
-
-@njit(**KERNEL)
-def cast(w, shadow, p, toward, light, weight, m, key):
-    """Write the shadow of walker w: from p toward a light of that colour."""
-    write(shadow.p, p)
-    write(shadow.d, toward)
-    for k in range(3):
-        shadow.colour[k] = w.colour[k] * w.weight * light[k] * weight
-    shadow.weight, shadow.luck, shadow.pdf, shadow.free = 1.0, 0.0, -1.0, -1.0
-    shadow.skip, shadow.key, shadow.events = 0.0, key, 0
-    shadow.sample, shadow.ray, shadow.medium, shadow.mode = w.sample, NONE, m, FLY
-    shadow.tries, shadow.shadow = 0, 1
-
-
-@njit(**KERNEL)
 def aim(w, offset, size, d_out, amount, c):
     """Begin a jump of given size along an offset of any length."""
     w.mode, w.length, w.gained, w.component = JUMP, size, amount, c
@@ -287,20 +179,6 @@ def aim(w, offset, size, d_out, amount, c):
 
 
 # ------------------------------------------------------------------------------------------ deep inside
-
-
-@njit(**KERNEL)
-def lives(w, key):
-    """Play roulette with a walker that has become dim: it ends, or goes on with what those that end had.
-
-    The chance to live is the throughput itself, without a cap, so light that loses nothing is never in play.
-    """
-    chance = 2.0 * math.exp(w.luck)
-    if unit(mix(key ^ OTHER)) >= chance:
-        return False
-    w.weight /= chance
-    w.luck = math.log(0.5)
-    return True
 
 
 @njit(**KERNEL)
@@ -323,6 +201,7 @@ def wander(w, amounts, once, out, out_amounts, live, most, g, media, tables, lig
     model, mean, reach, travel, sampled = media.model, media.free[m], media.reach[m], media.travel[m], lights.sampled
     first, last = media.first[m], media.first[m] + media.kinds[m] - 1
     luck, pdf, steps, state = w.luck, w.pdf, 0, 0
+    patience = min(PATIENCE, media.limit - w.events)
     bound, fresh = clearance(g, m, p), True
     while True:
         if free < 0.0:
@@ -333,7 +212,7 @@ def wander(w, amounts, once, out, out_amounts, live, most, g, media, tables, lig
                 bound = clearance(g, m, p)
             if bound <= free:
                 break
-        if steps >= PATIENCE or live >= most:
+        if steps >= patience or live >= most:
             state = 1
             break
         fresh = False
@@ -417,7 +296,7 @@ def wander(w, amounts, once, out, out_amounts, live, most, g, media, tables, lig
     write(w.p, p)
     write(w.d, d)
     w.key, w.free, w.luck, w.pdf = key, free, luck, pdf
-    if w.events > MAX_EVENTS:
+    if w.events >= media.limit:
         counters[TRUNCATED] += 1
         state = 2
     return live, state
@@ -489,6 +368,7 @@ def bounce(w, amounts, p, d, t, n, slack, surface, out, out_amounts, live, g, li
         w.colour[k] *= g.reflectance[surface, k]
     after = max(w.colour[0], w.colour[1], w.colour[2])
     if after <= 0.0:
+        w.weight = 0.0
         return live, ENDED
     w.events += 1
     w.key += GOLDEN
@@ -575,7 +455,8 @@ def land(w, amounts, hits, out, out_amounts, live, g, media, lights, counters):
 
 
 @njit(**KERNEL)
-def fly(w, amounts, hits, out, out_amounts, live, g, media, tables, lights, grains, absorption, radiance, counters):
+def fly(w, amounts, hits, out, out_amounts, live, g, room, media, tables, lights, grains, memory, absorption, radiance,
+        counters):  # fmt: skip
     """Take a walker along its straight flight to what comes first; return walkers in `out` and what becomes of it."""
     p, d = triple(w.p), triple(w.d)
     t, surface, n, slack, spurious = surface_met(g, p, d, hits, w.ray)
@@ -600,10 +481,17 @@ def fly(w, amounts, hits, out, out_amounts, live, g, media, tables, lights, grai
             if w.shadow:
                 return live, ENDED
             w.pdf = -1.0
-            s, centre, key = X.next_grain(grains, g, home, p, d, end)
+            s, centre, key = X.next_grain(grains, room, home, p, d, end)
             if s < math.inf and (t - s) * facing > slack:
                 enter(w, grains, media, home, s, centre, key)
                 return live, GO_ON
+        elif media.model == TELEPORT_MEMORY:
+            if w.free < 0.0:
+                M.begin(w, memory)
+            if w.free < t_b and (t - w.free) * facing > slack:
+                live, state = M.roam(w, amounts, True, out, out_amounts, live, live + 2, g, room, media, memory, tables,
+                                     lights, absorption, counters)  # fmt: skip
+                return live, ENDED if state == 2 else GO_ON
         elif w.shadow:
             w.weight *= math.exp(-end / media.free[home])
             if media.travel[home] >= 0:
@@ -634,7 +522,7 @@ def fly(w, amounts, hits, out, out_amounts, live, g, media, tables, lights, grai
         write(w.p, step(p, t_b + min(beyond(slack_b, dot(n_b, d)), 0.5 * (t - t_b)), d))
         w.medium = UNKNOWN
         w.events += 1
-        if w.events > MAX_EVENTS:
+        if w.events >= media.limit:
             counters[TRUNCATED] += 1
             return live, ENDED
         return live, GO_ON
@@ -694,7 +582,7 @@ def in_grain(w, amounts, facet, grains, media, absorption, counters):
         write(w.p, step(triple(w.q), radius, out))
         write(w.d, renewed(X.turned(w.grain, d, False)))
         w.mode, w.free = FLY, -1.0
-        if w.events > MAX_EVENTS:
+        if w.events >= media.limit:
             counters[TRUNCATED] += 1
             return ENDED
         if w.luck < DIM:
@@ -709,17 +597,18 @@ def in_grain(w, amounts, facet, grains, media, absorption, counters):
 
 @njit(**KERNEL)
 def advance(count, walkers, amounts, out, out_amounts, hits, grain_hits, starts, ways, grain_starts, grain_ways,
-            g, media, tables, lights, grains, absorption, radiance, counters, asked):  # fmt: skip
+            g, room, media, tables, lights, grains, memory, absorption, radiance, counters, asked):  # fmt: skip
     """Take each walker as far as it comes without the ray engine.
 
     What goes on is written to out and out_amounts, the rays it needs to starts and ways (n, 3) float32, and for the
-    exemplars to grain_starts and grain_ways (e, n, 3). `asked` (2 + e,) int64 receives the numbers of walkers, of rays
-    and of rays by exemplar.
+    exemplars to grain_starts and grain_ways (e, n, 3). What has ended stays in `walkers`, the number of its sample
+    inverted (~sample), of weight 0 unless it left the scene or reached the limit of events. `asked` (2 + e,) int64
+    receives the numbers of walkers, of rays and of rays by exemplar.
     """
     live, rays = 0, 0
     for i in range(asked.shape[0]):
         asked[i] = 0
-    explicit = media.model == EXPLICIT
+    explicit, remembers = media.model == EXPLICIT, media.model == TELEPORT_MEMORY
     for i in range(count):
         w, a = walkers[i], amounts[i]
         most = out.shape[0] - (count - i) - 2
@@ -736,14 +625,14 @@ def advance(count, walkers, amounts, out, out_amounts, hits, grain_hits, starts,
                 facet = NONE if e == X.EXACT_SPHERE else grain_hits[e, w.ray]
                 status = in_grain(w, a, facet, grains, media, absorption, counters)
                 if status == ENDED:
-                    w.sample = NONE
+                    w.sample = ~w.sample
                     break
                 continue
-            if w.mode == FLY and w.ray < 0 and w.medium >= 0 and not w.shadow:
+            if w.mode == FLY and w.ray < 0 and w.medium >= 0 and (remembers or not w.shadow):
                 if explicit:
                     bound = clearance(g, w.medium, triple(w.p))
                     if bound > 0.0:
-                        s, centre, key = X.next_grain(grains, g, w.medium, triple(w.p), triple(w.d), bound)
+                        s, centre, key = X.next_grain(grains, room, w.medium, triple(w.p), triple(w.d), bound)
                         if s < math.inf:
                             enter(w, grains, media, w.medium, s, centre, key)
                             turns += 1
@@ -751,11 +640,15 @@ def advance(count, walkers, amounts, out, out_amounts, hits, grain_hits, starts,
                                 break
                             continue
                 elif w.skip == 0.0:
-                    live, state = wander(
-                        w, a, False, out, out_amounts, live, most, g, media, tables, lights, absorption, counters
-                    )
+                    if remembers:
+                        live, state = M.roam(w, a, False, out, out_amounts, live, most, g, room, media, memory, tables,
+                                             lights, absorption, counters)  # fmt: skip
+                    else:
+                        live, state = wander(
+                            w, a, False, out, out_amounts, live, most, g, media, tables, lights, absorption, counters
+                        )
                     if state == 2:
-                        w.sample = NONE
+                        w.sample = ~w.sample
                         break
                     if state == 1:
                         break
@@ -772,11 +665,11 @@ def advance(count, walkers, amounts, out, out_amounts, hits, grain_hits, starts,
             if w.mode == JUMP:
                 live, status = land(w, a, hits, out, out_amounts, live, g, media, lights, counters)
             else:
-                live, status = fly(w, a, hits, out, out_amounts, live, g, media, tables, lights, grains, absorption,
-                                   radiance, counters)  # fmt: skip
+                live, status = fly(w, a, hits, out, out_amounts, live, g, room, media, tables, lights, grains, memory,
+                                   absorption, radiance, counters)  # fmt: skip
             w.ray = NONE
             if status == ENDED:
-                w.sample = NONE
+                w.sample = ~w.sample
                 break
         if w.sample >= 0:
             out[live] = w

@@ -3,7 +3,7 @@
 Here free paths, phase functions and absorption spectra become numbers per medium and component; how light uses them is
 `transport`, pictures are `render`. The levels, cheapest first: isotropic (point scatterers, similarity), volume-hg (one
 Henyey-Greenstein lobe), volume (tabulated deflections), teleport (Algorithm 1 of Meng et al. 2015), teleport-joint (its
-offsets kept together), explicit (packed grains, traced).
+offsets kept together), teleport-memory (where neighbours are as well), explicit (packed grains, traced).
 """
 
 import math
@@ -20,6 +20,8 @@ from tsdf.geometry import MESH, Place, ball_hit, exact_hit, place
 from tsdf.grains import first_hit, load_grain
 from tsdf.lights import LUMINANCE, LightArrays, compile_lights
 from tsdf.medium import Component, VolumeParameters, free_path, volume_parameters
+from tsdf.memory import Memory, memory_of
+from tsdf.neighbours import law
 from tsdf.optics import Optics
 from tsdf.sampler import Tables, compile_tables
 from tsdf.scatterometer import Effort, exact_sphere
@@ -37,18 +39,20 @@ from tsdf.scene import (
     absorption_at,
 )
 from tsdf.table import Table
-from tsdf.transport import (
+from tsdf.transport import Camera
+from tsdf.vectors import frame
+from tsdf.walker import (
     EXPLICIT,
     ISOTROPIC,
+    MAX_EVENTS,
     MODELS,
     TELEPORT,
     TELEPORT_JOINT,
+    TELEPORT_MEMORY,
     VOLUME_HG,
     Absorption,
-    Camera,
     Media,
 )  # fmt: skip
-from tsdf.vectors import frame
 
 DARKEST = 1e-300  # albedo, so that it has a logarithm
 LOOKS = 200  # pixels along each side through which it is looked whether the camera sees anything
@@ -67,7 +71,7 @@ class World:
         Geometry and its ray engine.
     packed : Packed
         Grains of the explicit level.
-    media, tables, lights, absorption
+    media, tables, memory, lights, absorption
         Arrays for kernels.
     amounts : int
         How many amounts of matter a walker counts.
@@ -83,6 +87,7 @@ class World:
     packed: Packed
     media: Media
     tables: Tables
+    memory: Memory
     lights: LightArrays
     absorption: Absorption
     amounts: int
@@ -163,7 +168,7 @@ def build(scene: Scene, level: str) -> World:
         return read[spec.table]
 
     tables = [table_of(grain) for medium in scene.media for grain in medium.grains]
-    made = place(scene)
+    made = place(scene, grains=model in (EXPLICIT, TELEPORT_MEMORY))
     notes = list(made.notes)
     media, absorption, parameters = _media(scene, model, tables)
     if model == TELEPORT_JOINT:
@@ -173,6 +178,7 @@ def build(scene: Scene, level: str) -> World:
                     f"{scene.name}: {grain.table} has no joint records, which level teleport-joint draws from; "
                     "build it with --joint 32"
                 )
+    memory = _memory(scene, tables if model == TELEPORT_MEMORY else [])
     for number, (medium, boundary) in enumerate(zip(scene.media, made.boundaries, strict=True), 1):
         extent = _extent(medium, boundary.vertices if boundary is not None else None)
         if 2.0 * medium.radius > extent:
@@ -186,7 +192,7 @@ def build(scene: Scene, level: str) -> World:
             f"{scene.name}: level explicit meets suns and small bright lights by chance alone: until many samples "
             "have, the picture is too dark and its variance does not tell; widen the sun or light by a smooth sky"
         )
-    grains = packed(scene, made, tables) if model == EXPLICIT else nothing_packed(len(scene.media), len(tables))
+    grains = packed(scene, tables) if model == EXPLICIT else nothing_packed(len(scene.media), len(tables))
     return World(
         scene=scene,
         level=level,
@@ -194,12 +200,36 @@ def build(scene: Scene, level: str) -> World:
         packed=grains,
         media=media,
         tables=compile_tables(tables or [_no_table()], joint=model == TELEPORT_JOINT),
+        memory=memory,
         lights=lights,
         absorption=absorption,
         amounts=len(absorption.least),
         parameters=parameters,
         notes=(*notes, *grains.notes),
     )
+
+
+def _memory(scene: Scene, tables: list[Table]) -> Memory:
+    """Return what level teleport-memory remembers, of nothing where there are no tables."""
+    if not tables:
+        return memory_of([], [], [], [])
+    laws, grains, at = [], [], 0
+    for number, medium in enumerate(scene.media, 1):
+        own = tables[at : at + len(medium.grains)]
+        at += len(own)
+        for grain, table in zip(medium.grains, own, strict=True):
+            if not table.memory:
+                raise SceneError(
+                    f"{scene.name}: {grain.table} has no records by entry, which level teleport-memory draws from; "
+                    "build it with --memory 64"
+                )
+        try:
+            laws.append(law(medium.packing_fraction))
+        except TSDFError as error:
+            raise SceneError(f"{scene.name}: [[medium]] {number} ({medium.name}): {error}") from None
+        grains.append([(table, grain.fraction) for grain, table in zip(medium.grains, own, strict=True)])
+    fractions = [medium.packing_fraction for medium in scene.media]
+    return memory_of(laws, fractions, [medium.radius for medium in scene.media], grains)
 
 
 def _extent(medium: MediumSpec, vertices: np.ndarray | None) -> float:
@@ -280,7 +310,11 @@ def _media(scene: Scene, model: int, tables: list[Table]) -> tuple[Media, Absorp
         if model == ISOTROPIC:
             free.append(1.0 / (volume.sigma_t * (1.0 - volume.g)))
         else:
-            free.append(path.lambda_beta if model in (TELEPORT, TELEPORT_JOINT, EXPLICIT) else 1.0 / volume.sigma_t)
+            free.append(
+                path.lambda_beta
+                if model in (TELEPORT, TELEPORT_JOINT, TELEPORT_MEMORY, EXPLICIT)
+                else 1.0 / volume.sigma_t
+            )
         reach.append(LONGEST_OFFSET * medium.radius if model in (TELEPORT, TELEPORT_JOINT) else 0.0)
         flown_wavelength, flown_channel = np.zeros(len(weight)), np.zeros(3)
         for i, probability in zip(these, path.choice, strict=True):
@@ -319,6 +353,7 @@ def _media(scene: Scene, model: int, tables: list[Table]) -> tuple[Media, Absorp
         scale=np.array(scale),
         slot=np.array(slots, np.int64),
         g=np.array(g),
+        limit=MAX_EVENTS,
     )
     absorption = Absorption(
         spectral=np.ascontiguousarray(spectral), rgb=np.ascontiguousarray(rgb), weight=np.ascontiguousarray(weight),
