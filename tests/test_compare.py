@@ -117,7 +117,7 @@ def test_pictures_that_cannot_be_compared() -> None:
 @pytest.fixture(scope="module")
 def ball() -> Scene:
     """A ball of 200 grains, white light above it and a black plate below."""
-    table = exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=64, joint=8))
+    table = exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=64, joint=8, memory=16))
     medium = MediumSpec(Sphere((0.0, 0.0, 0.0), 8.0), 0.4, 1.0, (GrainSpec(table),), packing_spheres=200)
     plate = SurfaceSpec(Sphere((0.0, 0.0, -29.0), 20.0), (0.0, 0.0, 0.0))
     camera = Camera((0.0, -40.0, 10.0), (0.0, 0.0, 0.0), 12, 9, fov_deg=30.0)
@@ -258,7 +258,7 @@ def status(*words: str) -> int:
 
 
 def test_command_writes_the_reports_and_the_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    table = exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=64, joint=8))
+    table = exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=64, joint=8, memory=16))
     tsdf.write(table, tmp_path / "sphere.tsdf.exr")
     (tmp_path / "scene.toml").write_text(SCENE)
     out = tmp_path / "new" / "out"

@@ -67,7 +67,7 @@ def sky(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def ball() -> Table:
     """Return the exact sphere; with 32 records instead of 128 the mean advance is 0.6 % too long."""
-    return scatterometer.exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=1024, joint=128))
+    return scatterometer.exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=1024, joint=128, memory=16))
 
 
 def traced(name: str, eta: float, paths: int, **parameters: Any) -> Table:
@@ -492,7 +492,9 @@ def test_grains_stand_whole_inside(ball: Table, tmp_path: Path, kind: str, burie
 # ---------------------------------------------------------------------------------------------- lights
 
 
-@pytest.mark.parametrize("level", ["teleport", "teleport-joint", "volume", "volume-hg", "isotropic", "explicit"])
+@pytest.mark.parametrize(
+    "level", ["teleport", "teleport-joint", "teleport-memory", "volume", "volume-hg", "isotropic", "explicit"]
+)
 def test_a_sun_looked_for_and_a_sun_found(ball: Table, level: str) -> None:
     """Next-event estimation changes no mean and shrinks the variance; half a sun more would be seen.
 
@@ -509,7 +511,7 @@ def test_a_sun_looked_for_and_a_sun_found(ball: Table, level: str) -> None:
     assert (0.8 < ratio < 1.25) if level == "explicit" else ratio > 3.0
 
 
-@pytest.mark.parametrize("level", ["teleport", "volume-hg"])
+@pytest.mark.parametrize("level", ["teleport", "teleport-memory", "volume-hg"])
 def test_a_small_sun_is_the_limit_of_wide_ones(ball: Table, level: str) -> None:
     """The irradiance, not the size, says how bright a slab is: 0.53 and 5 degrees."""
     suns = (SunLight((0.6, 0.0, 0.8), (1.0, 1.0, 1.0), size) for size in (0.53, 5.0))

@@ -221,6 +221,7 @@ def test_the_smallest_scenes(folder):
     for level in scene.LEVELS:
         assert parse(edited("render/level", level), folder).render.level == level
     for path, value in [
+        ("medium/0/inside", "centres"),
         ("camera/width", 65536),
         ("light/1/angular_diameter_deg", 180),
         ("medium/0/packing_fraction", 0.74),
@@ -262,7 +263,8 @@ BROKEN = [  # (path, value, what the line says after the name of the scene)
     ("camera/exposure", math.inf, "[camera]: exposure must be a finite number"),
     ("camera/exposure", 2000, "[camera]: exposure must be >= -100 and <= 100, not 2000"),
     ("render/level", "telport", "[render]: level cannot be 'telport'; did you mean 'teleport'?"),
-    ("render/level", "x", "[render]: level cannot be 'x'; it is one of explicit, teleport, teleport-joint, volume,"),
+    ("render/level", "x", "[render]: level cannot be 'x'; it is one of explicit, teleport-memory, teleport-joint,"),
+    ("medium/0/inside", "outside", "inside cannot be 'outside'; it is one of grains, centres"),
     ("render/level", 3, "[render]: level must be text, not 3"),
     ("render/spp", 0, "[render]: spp must be from 1 to"),
     ("render/spp", 2**40, "[render]: spp must be from 1 to"),

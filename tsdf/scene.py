@@ -161,9 +161,9 @@ class MediumSpec:
     radius: float  # bounding radius of the grains [unit]
     grains: tuple[GrainSpec, ...]
     name: str = ""
-    inside: str = "grains"  # what lies inside the shape: bounding spheres wholly, or their centres; one of INSIDE
     packing_seed: int = 0  # of the explicit level
     packing_spheres: int = 2000  # in the periodic tile of the explicit level
+    inside: str = "grains"  # what lies inside the shape: bounding spheres wholly, or their centres; one of INSIDE
 
 
 @dataclass(frozen=True)
