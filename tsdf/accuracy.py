@@ -30,6 +30,7 @@ MEASURED = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume
 FRACTIONS = (0.1, 0.3, 0.5, 0.6, 0.64)
 LAYERS = (2.0, 4.0, 10.0, 40.0)  # [R]
 ANGLES = (0.0, 60.0)  # [degrees]
+DARKEST = 100.0  # [1/R] absorption coefficient up to which that albedo is looked for
 ALBEDO = 0.99  # of a grain, in slabs that absorb
 SECONDS = 300.0
 LEAST_PACKINGS, MOST_PACKINGS = 4, 100
@@ -246,8 +247,15 @@ class _Run:
 
     def __post_init__(self) -> None:
         self.block = block_of(self.table)
-        lost = self.table.albedo()
-        self.absorbing = float(brentq(lambda c: self.table.albedo(c) / lost - ALBEDO, 0.0, 100.0))  # [1/R]
+        self.coefficients: tuple[float, ...] = (0.0,)  # of absorption, for lossless slabs and others [1/R]
+        if self.left(DARKEST) < 0.0:
+            self.coefficients += (float(brentq(self.left, 0.0, DARKEST)),)
+        else:
+            self.notes.append("slabs that absorb are left out: too little light is ever inside a grain")
+
+    def left(self, coefficient: float) -> float:
+        """Return by how much the albedo of a grain that absorbs is above what is asked for."""
+        return self.table.albedo(coefficient) / self.table.albedo() - ALBEDO
 
     def told(self, share: float, word: str) -> None:
         """Say that something is begun, which is a share of the whole."""
@@ -294,20 +302,20 @@ class _Run:
             made = self.possible(level, f, lambda: bulk_experiment(level, self.grain, f, packing, self.block))
             paths = self.paths and max(16, self.paths // BLOCKS)
             return gather(made, paths, seconds, seed, self.threads) if made else None
-        cosine, both = math.cos(math.radians(case.angle_deg)), (0.0, self.absorbing)
+        cosine, several = math.cos(math.radians(case.angle_deg)), self.coefficients
         if level not in MOVED:
             made = self.possible(
-                level, f, lambda: slab_experiment(level, self.grain, f, case.layer, cosine, packing, both)
+                level, f, lambda: slab_experiment(level, self.grain, f, case.layer, cosine, packing, several)
             )
             return gather(made, self.paths, seconds, seed, self.threads) if made else None
-        halves = []
-        for k, c in enumerate(both):
+        each = []
+        for k, c in enumerate(several):
             grain = replace(self.grain, absorption=Absorption("grey", (c,)))
             made = self.possible(level, f, lambda grain=grain: slab_experiment(level, grain, f, case.layer, cosine))  # type: ignore[misc]
             if made is None:
                 return None
-            halves.append(gather(made, self.paths, seconds and 0.5 * seconds, seed + k, self.threads))
-        return _beside(*halves)
+            each.append(gather(made, self.paths, seconds and seconds / len(several), seed + k, self.threads))
+        return _beside(each)
 
     def times(self, fraction: float) -> list[Row]:
         """Return rows of processor time per event in the bulk, from runs of all levels in turn."""
@@ -342,10 +350,11 @@ class _Run:
         return rows
 
 
-def _beside(first: Sums, second: Sums) -> Sums:
-    """Return the numbers of two runs one after the other, each as if of one path; their errors are kept."""
-    mean, error = np.concatenate((first.mean, second.mean)), np.concatenate((first.error, second.error))
-    return Sums(2, 2.0 * mean, 2.0 * (mean**2 + error**2), first.events + second.events, first.seconds + second.seconds)
+def _beside(runs: Sequence[Sums]) -> Sums:
+    """Return the numbers of runs one after the other, as if of two paths each, and with their errors."""
+    mean, error = np.concatenate([one.mean for one in runs]), np.concatenate([one.error for one in runs])
+    events, seconds = sum(one.events for one in runs), sum(one.seconds for one in runs)
+    return Sums(2, 2.0 * mean, 2.0 * (mean**2 + error**2), events, seconds)
 
 
 def _packed(sums: Sequence[Sums]) -> _Found:
@@ -379,7 +388,8 @@ def _bulk_rows(case: _Case, found: dict[str, _Found]) -> list[Row]:
 
 def _slab_rows(case: _Case, found: dict[str, _Found]) -> list[Row]:
     rows, each = [], 1 + len(PROFILE)
-    for k, albedo in enumerate((1.0, ALBEDO)):
+    most = max((len(one.mean) for one in found.values()), default=0)
+    for k, albedo in enumerate((1.0, ALBEDO)[: most // each]):
         rows += _compared("reflectance", case, albedo, k * each, found)
         rows += _compared("transmittance", case, albedo, k * each + 1, found)
         if "explicit" not in found:

@@ -28,9 +28,10 @@ CAMERA = Camera((0.0, 0.0, 10.0), (0.0, 0.0, 0.0), 1, 1, up=(0.0, 1.0, 0.0))
 LIGHT = (ConstantLight((1.0, 1.0, 1.0)),)
 PROFILE = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 1e30])  # [R]
 
-BLOCK, BLOCKS = 32, 32  # events of a block, at least, and blocks of a path in the bulk
+BLOCK, BLOCKS = 32, 12  # events of a block, at least, and blocks of a path in the bulk
 FORGOTTEN = 5e-4  # what light has left of its direction after a block, at most
-FIRST, GROWTH, MOST = 256, 8, 1 << 17  # paths of the first pass, of each over the one before, and of any
+FIRST, GROWTH, MOST = 1 << 13, 8, 1 << 17  # marks of the first pass, paths of each over all before, marks of any
+EAGER = 1024  # paths of the first pass, at most: the ray engine likes many at once
 FAINTEST = 1e-300  # [1/R] an absorption coefficient that counts lengths and takes no light
 
 
@@ -147,7 +148,7 @@ def follow(
     """
     assert not world.lights.sampled
     threads = threads or os.cpu_count() or 1
-    size = min(BATCH, -(-paths // 4))
+    size = min(BATCH, -(-paths // threads))
     jobs = [(at, min(size, first + paths - at)) for at in range(first, first + paths, size)]
     pool = ThreadPoolExecutor(threads)
     try:
@@ -205,9 +206,9 @@ def gather(
     experiment: Experiment, paths: int | None, seconds: float | None = None, seed: int = 0, threads: int | None = None
 ) -> Sums:
     """Follow so many paths of an experiment, or as many as there is time for on the clock, at least a few."""
-    e, sums, size = experiment, Sums(), MOST if seconds is None else FIRST
+    e, sums = experiment, Sums()
     _batch(e.world, e.camera, 0, 1, seed, 1)  # compiles, outside the time
-    size = max(1, size // e.marks)
+    size = MOST // e.marks if seconds is None else min(EAGER, FIRST // e.marks)
     began = time.perf_counter()
     while paths is None or sums.paths < paths:
         count = size if paths is None else min(size, paths - sums.paths)

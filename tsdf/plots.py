@@ -265,7 +265,7 @@ def _deviations(axes: Any, rows: Sequence[Mapping[str, Any]], over: str, styles:
                  and row["deviation"] == row["deviation"]), key=lambda row: row[over],
             )  # fmt: skip
             values = [100.0 * row["deviation"] for row in some]
-            errors = [100.0 * row["error"] / row["value"] for row in some]
+            errors = [100.0 * row["error"] / max(row["value"], 1e-300) for row in some]
             axes.errorbar(
                 [row[over] for row in some], values, errors, color=colour, linestyle=line, linewidth=1.2,
                 marker=MARKS.get(level, "o"), markersize=4.5, fillstyle=fill, capsize=2, elinewidth=0.8,
@@ -291,7 +291,7 @@ def _against_time(axes: Any, slabs: Sequence[Mapping[str, Any]], times: Sequence
     axes.set_yscale("log")
     points: list[tuple[str, float, float, float]] = []
     for row in times:
-        own = [one for one in slabs if one["level"] == row["level"]]
+        own = [one for one in slabs if one["level"] == row["level"] and one["value"] > 0.0]
         far = [one for one in own if one["deviation"] == one["deviation"]]
         if row["level"] == "explicit" and own:
             points.append((row["level"], row["value"], 0.0, max(100.0 * one["error"] / one["value"] for one in own)))
