@@ -139,10 +139,10 @@ def measured(works: dict[str, Callable[[int], float]], events: int, rounds: int)
     return times
 
 
-def built(grain: str, paths: int, records: int) -> Table:
+def built(grain: str, paths: int, records: int, memory: int = 0) -> Table:
     """Return a table of an exemplar."""
     shape = load_grain(grain)
-    build = Build.start(shape, Optics(1.31), Effort(paths=paths, joint=records))
+    build = Build.start(shape, Optics(1.31), Effort(paths=paths, joint=records, memory=memory))
     build.run(shape)
     return build.table()
 

@@ -172,6 +172,19 @@ def test_noise_of_a_profile_is_what_equal_profiles_differ_by(grain: GrainSpec) -
     assert rows[1].value > 4.0 * rows[1].error
 
 
+def test_lost_paths_are_counted_and_left_out() -> None:
+    """A path that did not come to its last block has no number; the mean is that of the others."""
+    nothing = experiment.Ends(*(np.zeros((0, 3)) for _ in range(3)), np.zeros(0), np.zeros((0, 0)), 0, 0.0)
+    sums = Sums()
+    sums.add(np.array([[1.0], [math.nan], [3.0]]), nothing)
+    assert (sums.paths, sums.lost, sums.mean[0]) == (2, 1, 2.0)
+    made = experiment.bulk_experiment("volume", GrainSpec(exact_sphere(load_grain("sphere"), Optics(1.31))), 0.5)
+    places = np.ones((3, experiment.BLOCKS + 1, 3))
+    places[1, -2:] = 0.0
+    places[2, 5:] = 2.0 * experiment.FAR
+    assert list(np.isnan(made.read(places, nothing)[:, 0])) == [False, True, True]
+
+
 @pytest.fixture(scope="module")
 def small(grain: GrainSpec) -> accuracy.Accuracy:
     return measure(grain, [0.05], [10.0], paths=256, seed=3, threads=1)

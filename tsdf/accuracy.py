@@ -278,18 +278,20 @@ class _Run:
         share = most / bulks if bulk else (1.0 - BULK - TIMED) / (cases - bulks)
         share /= len(self.levels) - 1 + self.packings
         found: dict[str, _Found] = {}
+        word = f"packing fraction {case.fraction:g}, "
+        word += "bulk" if bulk else f"layer of {case.layer:g} R at {case.angle_deg:g} degrees"
         for level in self.levels:
             runs = self.packings if level == "explicit" else 1
             sums = []
             for k in range(runs):
-                word = f"packing fraction {case.fraction:g}, "
-                word += "bulk" if bulk else f"layer of {case.layer:g} R at {case.angle_deg:g} degrees"
                 self.told(share, f"{word}, {level}" + (f" {k + 1} of {runs}" if runs > 1 else ""))
                 one = self.one(level, case, k, number, share)
                 if one is None:
                     self.done += share * (runs - k - 1)
                     break
                 sums.append(one)
+            if lost := sum(one.lost for one in sums):
+                self.notes.append(f"{word}, {level}: {lost} paths were lost, and are left out")
             if sums:
                 found[level] = _packed(sums)
         return _bulk_rows(case, found) if bulk else _slab_rows(case, found)

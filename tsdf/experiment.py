@@ -173,15 +173,19 @@ class Experiment:
 
 @dataclass
 class Sums:
-    """Means of numbers over paths, as far as they have been followed."""
+    """Means of numbers over paths, as far as they have been followed; those without numbers are lost."""
 
     paths: int = 0
     total: np.ndarray | float = 0.0
     squares: np.ndarray | float = 0.0
     events: int = 0
     seconds: float = 0.0
+    lost: int = 0
 
     def add(self, values: np.ndarray, ends: Ends) -> None:
+        there = np.isfinite(values).all(axis=1)
+        self.lost += int((~there).sum())
+        values = values[there]
         self.paths += len(values)
         self.total, self.squares = self.total + values.sum(axis=0), self.squares + (values**2).sum(axis=0)
         self.events, self.seconds = self.events + ends.events, self.seconds + ends.seconds
@@ -210,9 +214,10 @@ def gather(
     _batch(e.world, e.camera, 0, 1, seed, 1)  # compiles, outside the time
     size = MOST // e.marks if seconds is None else min(EAGER, FIRST // e.marks)
     began = time.perf_counter()
-    while paths is None or sums.paths < paths:
-        count = size if paths is None else min(size, paths - sums.paths)
-        places, ends = follow(e.world, e.camera, count, seed, e.marks, threads, sums.paths)
+    while paths is None or sums.paths + sums.lost < paths:
+        done = sums.paths + sums.lost
+        count = size if paths is None else min(size, paths - done)
+        places, ends = follow(e.world, e.camera, count, seed, e.marks, threads, done)
         sums.add(e.read(places, ends), ends)
         if paths is not None:
             continue
@@ -252,7 +257,9 @@ def bulk_experiment(
     def read(places: np.ndarray, ends: Ends) -> np.ndarray:
         steps = np.diff(places, axis=1)
         near = steps[:, :-2] + steps[:, 1:-1] + steps[:, 2:]
-        return np.asarray((steps[:, 1:-1] * near).sum(axis=2).mean(axis=1) / block)[:, None]
+        squares = np.asarray((steps[:, 1:-1] * near).sum(axis=2).mean(axis=1) / block)
+        ended = ~places[:, -1].any(axis=1) | (np.abs(places) > 0.5 * FAR).any(axis=(1, 2))
+        return np.where(ended, math.nan, squares)[:, None]
 
     return Experiment(world, beam(world, (0.0, 0.0, 0.0), (0.36, 0.48, 0.8), WIDE), blocks + 1, read)
 
