@@ -178,7 +178,9 @@ def test_lost_paths_are_counted_and_left_out() -> None:
     sums = Sums()
     sums.add(np.array([[1.0], [math.nan], [3.0]]), nothing)
     assert (sums.paths, sums.lost, sums.mean[0]) == (2, 1, 2.0)
-    made = experiment.bulk_experiment("volume", GrainSpec(exact_sphere(load_grain("sphere"), Optics(1.31))), 0.5)
+    made = experiment.bulk_experiment(
+        "volume", GrainSpec(exact_sphere(load_grain("sphere"), Optics(1.31), Effort(cells=32))), 0.5
+    )
     places = np.ones((3, experiment.BLOCKS + 1, 3))
     places[1, -2:] = 0.0
     places[2, 5:] = 2.0 * experiment.FAR
