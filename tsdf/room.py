@@ -91,7 +91,7 @@ def parted(corners, p, q):
     height = dot(x, n)
     if (height > 0.0) == (height > dot(d, n)):
         return False
-    # Signs of three volumes, which two facets with an edge in common see alike: the edge is in one of them
+    # Signs of three volumes, which two facets see alike at the edge they share: none slips through between them
     a, b, c = dot(d, cross(x, y)) > 0.0, dot(d, cross(y, z)) > 0.0, dot(d, cross(z, x)) > 0.0
     return a == b and b == c
 
