@@ -99,6 +99,20 @@ def test_thin_slab_is_single_scattering(table: Table, grain: GrainSpec) -> None:
     assert abs(tilted.reflectance - once) > SIGMAS * tilted.reflectance_error + 2.0 * t * once
 
 
+def test_slabs_are_cut_from_several_heights(grain: GrainSpec) -> None:
+    """Cuts are as far apart as a layer and a grain, and within the tile; the height of a slab is
+    nothing to a level without single grains."""
+    for layer in (2.0, 4.0, 10.0, 40.0):
+        tops = experiment.cuts(0.6, layer)
+        side = (2000 * 4.0 / 3.0 * math.pi / 0.6) ** (1.0 / 3.0)
+        assert tops[0] == 0.0 and len(tops) <= experiment.MOST_CUTS
+        assert all(b - a >= layer + 2.0 for a, b in zip(tops, [*tops[1:], side], strict=True)) or len(tops) == 1
+    assert len(experiment.cuts(0.6, 2.0)) == 4
+    low, high = (gather(slab_experiment("teleport", grain, 0.5, 4.0, 0.5, top=top), 2000) for top in (0.0, 7.0))
+    assert np.allclose(low.mean, high.mean, atol=3e-3)
+    assert high.mean[:2].sum() == pytest.approx(1.0, abs=1e-12)
+
+
 def test_the_same_numbers_for_any_threads(grain: GrainSpec) -> None:
     """Paths have random numbers of their own: threads and passes change nothing but the rounding of sums."""
     world = slab_experiment("teleport-memory", grain, 0.5, 4.0)

@@ -17,7 +17,18 @@ from scipy.optimize import brentq
 
 from tsdf import format
 from tsdf.errors import TSDFError, UsageError
-from tsdf.experiment import BLOCKS, PROFILE, Experiment, Sums, block_of, bulk_experiment, gather, slab_experiment
+from tsdf.experiment import (
+    BLOCKS,
+    MOST_CUTS,
+    PROFILE,
+    Experiment,
+    Sums,
+    block_of,
+    bulk_experiment,
+    cuts,
+    gather,
+    slab_experiment,
+)
 from tsdf.experiment import diffusion as diffusion
 from tsdf.experiment import follow as follow
 from tsdf.experiment import slab as slab
@@ -34,6 +45,7 @@ DARKEST = 100.0  # [1/R] absorption coefficient up to which that albedo is looke
 ALBEDO = 0.99  # of a grain, in slabs that absorb
 SECONDS = 300.0
 LEAST_PACKINGS, MOST_PACKINGS = 4, 100
+MOST_RUNS = MOST_PACKINGS * MOST_CUTS  # of one case at one level, each with random numbers of its own
 SHOWN = 0.6  # packing fraction that the chart's slabs are nearest to
 BULK, TIMED = 0.25, 0.1  # shares of the time for the bulk and for the time per event
 ROUNDS = 5  # of all levels in turn, for the time per event
@@ -280,14 +292,16 @@ class _Run:
         found: dict[str, _Found] = {}
         word = f"packing fraction {case.fraction:g}, "
         word += "bulk" if bulk else f"layer of {case.layer:g} R at {case.angle_deg:g} degrees"
+        tops = [0.0] if bulk else cuts(case.fraction, case.layer)
         for level in self.levels:
-            runs = self.packings if level == "explicit" else 1
+            runs = [(k, top) for top in tops for k in range(self.packings)] if level == "explicit" else [(0, 0.0)]
+            own = share * (self.packings if level == "explicit" else 1) / len(runs)
             sums = []
-            for k in range(runs):
-                self.told(share, f"{word}, {level}" + (f" {k + 1} of {runs}" if runs > 1 else ""))
-                one = self.one(level, case, k, number, share)
+            for k, (packing, top) in enumerate(runs):
+                self.told(own, f"{word}, {level}" + (f" {k + 1} of {len(runs)}" if len(runs) > 1 else ""))
+                one = self.one(level, case, packing, top, own, MOST_RUNS * (len(LEVELS) * number) + k)
                 if one is None:
-                    self.done += share * (runs - k - 1)
+                    self.done += own * (len(runs) - k - 1)
                     break
                 sums.append(one)
             if lost := sum(one.lost for one in sums):
@@ -296,10 +310,10 @@ class _Run:
                 found[level] = _packed(sums)
         return _bulk_rows(case, found) if bulk else _slab_rows(case, found)
 
-    def one(self, level: str, case: _Case, packing: int, number: int, share: float) -> Sums | None:
+    def one(self, level: str, case: _Case, packing: int, top: float, share: float, number: int) -> Sums | None:
         """Return what a level makes of a case in one packing; None where it is impossible."""
         f, seconds = case.fraction, self.seconds and share * self.seconds
-        seed = (self.seed + 1 + MOST_PACKINGS * (len(LEVELS) * number + LEVELS.index(level)) + packing) % LARGEST_SEED
+        seed = (self.seed + 1 + MOST_RUNS * LEVELS.index(level) + number) % LARGEST_SEED
         if math.isnan(case.layer):
             made = self.possible(level, f, lambda: bulk_experiment(level, self.grain, f, packing, self.block))
             paths = self.paths and max(16, self.paths // BLOCKS)
@@ -307,7 +321,7 @@ class _Run:
         cosine, several = math.cos(math.radians(case.angle_deg)), self.coefficients
         if level not in MOVED:
             made = self.possible(
-                level, f, lambda: slab_experiment(level, self.grain, f, case.layer, cosine, packing, several)
+                level, f, lambda: slab_experiment(level, self.grain, f, case.layer, cosine, packing, several, top)
             )
             return gather(made, self.paths, seconds, seed, self.threads) if made else None
         each = []
@@ -360,7 +374,8 @@ def _beside(runs: Sequence[Sums]) -> Sums:
 
 
 def _packed(sums: Sequence[Sums]) -> _Found:
-    """Return the mean over packings, and its error: from paths, or from what packings differ by where that is more."""
+    """Return the mean over packings, or slabs from them, and its error: from paths, or from what these differ by where
+    that is more."""
     means, errors = np.array([one.mean for one in sums]), np.array([one.error for one in sums])
     paths = np.sqrt((errors**2).sum(axis=0)) / len(sums)
     if len(sums) == 1:
@@ -432,7 +447,7 @@ def markdown(accuracy: Accuracy) -> str:
     text = [
         f"# {title}: levels against packed grains",
         "",
-        f"Explicit is the mean of {a.packings} packings."
+        f"Explicit is the mean of {a.packings} packings, and of slabs from several heights of each."
         + " **Interrupted: not all that was asked for.**" * a.interrupted,
     ]
     text += ["", *_worst(a)]

@@ -32,6 +32,8 @@ BLOCK, BLOCKS = 32, 12  # events of a block, at least, and blocks of a path in t
 FORGOTTEN = 5e-4  # what light has left of its direction after a block, at most
 FIRST, GROWTH, MOST = 1 << 13, 8, 1 << 17  # marks of the first pass, paths of each over all before, marks of any
 EAGER = 1024  # paths of the first pass, at most: the ray engine likes many at once
+MOST_CUTS = 4  # slabs from one tile
+SPHERES = 2000  # in a tile
 FAINTEST = 1e-300  # [1/R] an absorption coefficient that counts lengths and takes no light
 
 
@@ -237,8 +239,16 @@ def scene_of(
     shape: Slab | Sphere, grain: GrainSpec, fraction: float, packing: int = 0, inside: str = "centres"
 ) -> Scene:
     """Return a scene of one medium of grains of radius 1 under constant light."""
-    medium = MediumSpec(shape, fraction, 1.0, (grain,), name="grains", inside=inside, packing_seed=packing)
+    medium = MediumSpec(shape, fraction, 1.0, (grain,), name="grains", inside=inside, packing_seed=packing,
+                         packing_spheres=SPHERES)  # fmt: skip
     return Scene(CAMERA, LIGHT, (medium,), name=f"packing fraction {fraction:g}")
+
+
+def cuts(fraction: float, layer: float) -> list[float]:
+    """Return at which heights slabs of a layer [R] can be cut from the tile of a packing and share no sphere [R]."""
+    side = (SPHERES * 4.0 / 3.0 * math.pi / fraction) ** (1.0 / 3.0)
+    count = min(MOST_CUTS, max(1, int(side / (layer + 2.0))))
+    return [side * k / count for k in range(count)]
 
 
 def block_of(table: Table) -> int:
@@ -289,16 +299,16 @@ def diffusion(level: str, grain: GrainSpec, fraction: float, paths: int, seed: i
 
 def slab_experiment(
     level: str, grain: GrainSpec, fraction: float, layer: float, cosine: float = 1.0, packing: int = 0,
-    coefficients: Sequence[float] | None = None,
+    coefficients: Sequence[float] | None = None, top: float = 0.0,
 ) -> Experiment:  # fmt: skip
     """Return what `slab` measures: reflectance, transmittance and profile one after the other, and so again for each of
-    several absorption coefficients [1/R] if they are given, of the very same paths."""
+    several absorption coefficients [1/R] if they are given, of the very same paths. The layer ends at height `top`."""
     if coefficients is not None:
         grain = replace(grain, absorption=Absorption("grey", (FAINTEST,)))
-    world = build(scene_of(Slab(-layer, 0.0), grain, fraction, packing), level)
+    world = build(scene_of(Slab(top - layer, top), grain, fraction, packing), level)
     way = np.array([math.sqrt(1.0 - cosine**2), 0.0, -cosine])
     high = 5.0 + WIDE  # the beam's tilted square begins above the slab
-    middle = world.place.centre[2]  # heights are relative to it
+    middle = world.place.centre[2] - top  # heights are relative to it
     bins = len(PROFILE) - 1
 
     def read(places: np.ndarray, ends: Ends) -> np.ndarray:
@@ -322,7 +332,7 @@ def slab_experiment(
             some.append(values)
         return np.concatenate(some, axis=1)
 
-    return Experiment(world, beam(world, -way * high / cosine, way, WIDE), 1, read)
+    return Experiment(world, beam(world, (0.0, 0.0, top) - way * high / cosine, way, WIDE), 1, read)
 
 
 def slab(level: str, grain: GrainSpec, fraction: float, layer: float, paths: int, cosine: float = 1.0, seed: int = 0,
