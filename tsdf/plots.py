@@ -205,6 +205,7 @@ def plot_accuracy(rows: Sequence[Mapping[str, Any]], fraction: float, title: str
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
+    from matplotlib.ticker import MaxNLocator
 
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.0, 3.9), layout="constrained")
@@ -214,8 +215,7 @@ def plot_accuracy(rows: Sequence[Mapping[str, Any]], fraction: float, title: str
         left.set_title("bulk: mean squared displacement per event")
         left.set_xlabel("packing fraction")
         left.set_ylabel("deviation from explicit [%]")
-        left.set_xticks(sorted({row["fraction"] for row in bulk}))
-        left.xaxis.set_major_formatter("{x:g}")
+        left.xaxis.set_major_locator(MaxNLocator(7))
         slabs = [row for row in rows if row["quantity"] == "reflectance" and row["fraction"] == fraction]
         clear = [row for row in slabs if row["albedo"] == 1.0]
         angles = sorted({row["angle_deg"] for row in clear})
