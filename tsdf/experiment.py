@@ -16,6 +16,7 @@ import numpy as np
 
 from tsdf import transport as T
 from tsdf import walker as W
+from tsdf.packing import cells_of, pack
 from tsdf.render import SLOTS, Walkers
 from tsdf.scene import Absorption, Camera, ConstantLight, GrainSpec, MediumSpec, Scene, Slab, Sphere
 from tsdf.table import Table
@@ -297,18 +298,29 @@ def diffusion(level: str, grain: GrainSpec, fraction: float, paths: int, seed: i
     return Value(float(sums.mean[0]), float(sums.error[0]), sums.event)
 
 
+def _lower(world: World, fraction: float, packing: int, height: float) -> None:
+    """Move the spheres of a packed world down, all the same."""
+    made = pack(fraction, SPHERES, packing)
+    moved = replace(made, centres=(made.centres - (0.0, 0.0, height)) % made.side)
+    arrays = world.packed.arrays
+    world.packed.arrays = arrays._replace(cells=(cells_of(moved),), centres=(np.ascontiguousarray(moved.centres),))
+
+
 def slab_experiment(
     level: str, grain: GrainSpec, fraction: float, layer: float, cosine: float = 1.0, packing: int = 0,
     coefficients: Sequence[float] | None = None, top: float = 0.0,
 ) -> Experiment:  # fmt: skip
     """Return what `slab` measures: reflectance, transmittance and profile one after the other, and so again for each of
-    several absorption coefficients [1/R] if they are given, of the very same paths. The layer ends at height `top`."""
+    several absorption coefficients [1/R] if they are given, of the very same paths. The layer's
+    upper end is at height `top` of the tile."""
     if coefficients is not None:
         grain = replace(grain, absorption=Absorption("grey", (FAINTEST,)))
-    world = build(scene_of(Slab(top - layer, top), grain, fraction, packing), level)
+    world = build(scene_of(Slab(-layer, 0.0), grain, fraction, packing), level)
+    if level == "explicit":
+        _lower(world, fraction, packing, top)
     way = np.array([math.sqrt(1.0 - cosine**2), 0.0, -cosine])
     high = 5.0 + WIDE  # the beam's tilted square begins above the slab
-    middle = world.place.centre[2] - top  # heights are relative to it
+    middle = world.place.centre[2]  # heights are relative to it
     bins = len(PROFILE) - 1
 
     def read(places: np.ndarray, ends: Ends) -> np.ndarray:
@@ -332,7 +344,7 @@ def slab_experiment(
             some.append(values)
         return np.concatenate(some, axis=1)
 
-    return Experiment(world, beam(world, (0.0, 0.0, top) - way * high / cosine, way, WIDE), 1, read)
+    return Experiment(world, beam(world, -way * high / cosine, way, WIDE), 1, read)
 
 
 def slab(level: str, grain: GrainSpec, fraction: float, layer: float, paths: int, cosine: float = 1.0, seed: int = 0,
