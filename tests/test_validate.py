@@ -215,3 +215,20 @@ def test_zhou_curve_is_the_published_one():
     np.testing.assert_allclose(mine, curve, rtol=4e-3)
     circles = reference("zhou2003_fig8_montecarlo.csv")
     assert len(circles["theta_deg"]) == 17
+
+
+def test_a_mirror_is_valid_and_cannot_be_listed(tmp_path):
+    """A sphere of eta 1e9 reflects everything, the same in all directions; by quadrature it is refused in one line."""
+    from tsdf import scatterometer
+    from tsdf.errors import UsageError
+    from tsdf.grains import load_grain
+    from tsdf.optics import Optics
+
+    sphere, effort = load_grain("sphere"), scatterometer.Effort(20_000, cells=16, memory=8)
+    with pytest.raises(UsageError, match="--traced"):
+        scatterometer.exact_sphere(sphere, Optics(1e9), effort)
+    build = scatterometer.Build.start(sphere, Optics(1e9), effort)
+    build.run(sphere)
+    table = build.table()
+    assert abs(table.mean_cosine()) < 1e-3
+    assert judge(table)[0] == ()

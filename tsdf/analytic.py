@@ -33,6 +33,7 @@ EXACT_ORDERS = 12  # orders whose cell masses are found by roots; the rest by in
 LISTED_ORDERS = 32  # length of SphereStatistics.order_energy
 MEAN_R_NODES = 65536
 TAIL_INTERVALS = 16384
+ETA = (0.01, 100.0)  # beyond, light stays inside for more orders than can be summed
 
 # Panels of u: uniform, the last one halved again and again towards grazing, where the reflectance runs to 1.
 _PANELS = np.concatenate([np.linspace(0, 1, 33)[:-1], 1 - 0.5 ** np.arange(6, 40), [1.0]]) * (np.pi / 2)
@@ -911,6 +912,11 @@ def _check(eta: float, fresnel: str, absorption: float) -> bool:
         raise UsageError(f"eta and absorption must be numbers, not {eta!r} and {absorption!r}") from None
     if not (np.isfinite(values[0]) and values[0] > 0):
         raise UsageError(f"eta must be a positive number, not {eta!r}")
+    if not ETA[0] <= values[0] <= ETA[1]:
+        raise UsageError(
+            f"a sphere of eta {eta:g} keeps light for too many orders to sum them: eta must be "
+            f"{ETA[0]:g} to {ETA[1]:g}, or the sphere traced (tsdf-build sphere --traced)"
+        )
     if not (np.isfinite(values[1]) and values[1] >= 0):
         raise UsageError(f"absorption must be a number of at least 0, not {absorption!r}")
     if fresnel not in ("un", "sp"):

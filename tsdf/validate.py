@@ -377,7 +377,7 @@ def _stated_errors(gavel: _Judge, t: _Subject) -> None:
         if t.exact:
             gavel.near(code, pointer, what, error, 0.0, 0.0)
             continue
-        if name in scattering and t.eta != 1.0:
+        if name in scattering and t.eta != 1.0 and t.s[name] != 0.0:  # 0 if light enters nothing: a mirror
             gavel.require(error > 0.0, code, pointer, f"{what} is 0 in a traced table")
         if name in width and met > 0.0:
             # no variance of a bounded quantity is larger than (range / 2)^2; 1.5 for the error of the error
@@ -606,6 +606,8 @@ def _sphere_masses(edges: tuple[float, ...], eta: float, fresnel: str) -> np.nda
 
 def _sphere(gavel: _Judge, t: _Subject) -> None:
     """The table of a sphere against geometrical optics."""
+    if not analytic.ETA[0] <= t.eta <= analytic.ETA[1]:
+        return  # a mirror, or nearly, of which theorems alone say what it does
     fresnel = t.header["optics"]["fresnel"]
     truth = _sphere_truth(t.eta, fresnel)
     # what the tracer dropped had travelled as far as its bounces go
