@@ -407,3 +407,18 @@ def test_merging_cells_keeps_the_sums() -> None:
         assert np.array_equal(columns[:, -1], tally.theta[:, T.FINE])
         edges = estimate.cos_theta_edges(cells)
         assert np.all(np.diff(edges[1:-1]) > 0)
+
+
+def test_records_by_entry_keep_the_means_of_all_paths():
+    """A chain of grains multiplies what its records get wrong, so the mean deflection and offset are those of the
+    header, not of a sample of so many."""
+    grain = load_grain("cube")
+    build = Build.start(grain, Optics(1.31), Effort(100_000, cells=64, memory=16))
+    build.run(grain)
+    table = build.table()
+    share = table.hit / table.hit.sum()
+    means = {name: float(table.memory[name].mean(axis=0) @ share) for name in ("cos_theta", "r", "z")}
+    sample = float(table.memory["cos_theta"].std()) / math.sqrt(table.memory["cos_theta"].size)
+    s = table.statistics
+    assert abs(means["cos_theta"] - s["mean_cosine"]) < 0.25 * sample
+    assert abs(means["z"] - s["mean_z"]) < 0.02 and abs(means["r"] - s["mean_r"]) < 0.02

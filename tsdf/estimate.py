@@ -6,7 +6,7 @@ bytes.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
@@ -34,6 +34,7 @@ STATISTICS = (
     "atom_backward",
 )
 LICENCE = "CC0-1.0"
+SHIFT = (math.sqrt(5.0) - 1.0) / 2.0  # its multiples fall evenly into [0, 1)
 
 
 @dataclass(frozen=True)
@@ -327,10 +328,10 @@ def fits(p_theta: np.ndarray, edges: np.ndarray, mean_cosine: float) -> dict[str
     }
 
 
-def systematic(weights: np.ndarray, count: int) -> np.ndarray:
-    """Return `count` indices in proportion to `weights`, evenly spaced in the running sum."""
+def systematic(weights: np.ndarray, count: int, first: float = 0.5) -> np.ndarray:
+    """Return `count` indices in proportion to `weights`, evenly spaced in the running sum from `first` steps on."""
     running = np.cumsum(weights)
-    return np.searchsorted(running, (np.arange(count) + 0.5) / count * running[-1], side="right").clip(
+    return np.searchsorted(running, (np.arange(count) + first) / count * running[-1], side="right").clip(
         0, len(weights) - 1
     )
 
@@ -389,13 +390,15 @@ def memory_of(tally: Tally, columns: int, count: int) -> Memory:
     The cells do not end where the reservoirs do. Of the reservoirs that a cell touches, the least of the largest keys
     is a threshold that does not change with the key of any record below it. So the records below it are a priority
     sample of all that light and of any part of it: each stands for its weight, or for the inverse threshold if that is
-    more, and `count` are drawn in proportion to that.
+    more. What they stand for is calibrated to the means of all paths, and `count` are drawn in proportion to that,
+    evenly over cos theta: a chain of grains multiplies what a small sample gets wrong.
     """
     b2 = 2 + MEMORY_FIELDS.index("entry_b2")
     rays, met = _in_equal_cells(np.stack((tally.entry[0], tally.entry[0] - tally.entry[1])), columns)
     hit = np.minimum(ratio(met, rays), 1.0)
     thresholds = tally.entry_records[:, :, 0].max(axis=1)
-    records = np.zeros((len(MEMORY_FIELDS), count, columns))
+    found: list[np.ndarray] = []
+    weights: list[np.ndarray] = []
     for column in range(columns):
         low, high = column / columns, (column + 1) / columns
         touched = slice(int(low * T.COARSE), math.ceil(high * T.COARSE))
@@ -405,14 +408,60 @@ def memory_of(tally: Tally, columns: int, count: int) -> Memory:
         rows = rows[inside & (rows[:, 0] < threshold)]
         if len(rows) == 0 or not (hit[column] > 0.0):
             hit[column] = 0.0
-            continue
-        rows = rows[np.lexsort((*rows.T[::-1], rows[:, b2]))]  # by entry_b2, and by the rest where that is equal
-        weights = np.maximum(rows[:, 1], 1.0 / threshold)
-        records[:, :, column] = rows[systematic(weights, count), 2:].T
+            rows = rows[:0]
+        rows = rows[np.lexsort(rows.T[::-1])]  # an order that does not depend on how the reservoirs were filled
+        found.append(rows[:, 2:])
+        weights.append(np.maximum(rows[:, 1], 1.0 / threshold))
+    sums = tally.scalars.astype(np.float64).sum(axis=0)
+    means = {name: sums[i] / sums[T.SCATTERED] for name, i in
+             (("cos_theta", T.COS_THETA), ("r", T.MEAN_R), ("z", T.MEAN_Z))}  # fmt: skip
+    _calibrate(found, weights, hit, means)
+    records = np.zeros((len(MEMORY_FIELDS), count, columns))
+    cos_theta, b2 = MEMORY_FIELDS.index("cos_theta"), b2 - 2
+    for column, (rows, weight) in enumerate(zip(found, weights, strict=True)):
+        if len(rows):
+            order = np.argsort(rows[:, cos_theta], kind="stable")
+            chosen = rows[order[systematic(weight[order], count, column * SHIFT % 1.0)]]
+            records[:, :, column] = chosen[np.argsort(chosen[:, b2], kind="stable")].T
     for name in ("entry_azimuth", "phi_delta"):
         angles = records[MEMORY_FIELDS.index(name)]
         angles[angles <= -math.pi] = math.pi
     return Memory(hit, records)
+
+
+def _calibrate(
+    found: Sequence[np.ndarray], weights: list[np.ndarray], hit: np.ndarray, means: Mapping[str, float]
+) -> None:
+    """Change the weights of records as little as gives them known means (raking, Deville & Särndal 1992).
+
+    Parameters
+    ----------
+    found : sequence of (n, fields) arrays
+        Records of each column.
+    weights : list of (n,) arrays
+        What they stand for, to be changed; left as it is where the means are out of reach.
+    hit : (columns,) array
+        Share of light that each column has.
+    """
+    fields = [MEMORY_FIELDS.index(name) for name in means]
+    tilt, target = np.zeros(len(fields)), np.array(list(means.values()))
+    lit = [c for c in range(len(found)) if len(found[c])]
+    for _ in range(8):
+        mean, spread = np.zeros(len(fields)), np.zeros((len(fields), len(fields)))
+        for c in lit:
+            x = found[c][:, fields]
+            w = weights[c] * np.exp((x - target) @ tilt)
+            w *= hit[c] / w.sum()
+            own = w @ x
+            mean += own
+            spread += (x * w[:, None]).T @ x - np.outer(own, own) / hit[c]
+        total = hit[lit].sum()
+        step = np.linalg.lstsq(spread / total, target - mean / total, rcond=1e-9)[0]
+        tilt = tilt + step
+        if not (np.abs(tilt) < 1.0).all():
+            return
+    for c in lit:
+        weights[c] = weights[c] * np.exp((found[c][:, fields] - target) @ tilt)
 
 
 def _in_equal_cells(counts: np.ndarray, columns: int) -> np.ndarray:

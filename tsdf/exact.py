@@ -17,6 +17,7 @@ from tsdf.errors import UsageError
 from tsdf.estimate import (
     LEGENDRE,
     MAX_CELLS,
+    SHIFT,
     STATISTICS,
     Factorisation,
     Memory,
@@ -32,9 +33,6 @@ from tsdf.optics import Optics
 from tsdf.table import MEMORY_FIELDS, RECORD_FIELDS, Table
 
 LEDGER_UNITS = 1 << 52  # energy units of an exact table
-
-
-SHIFT = (math.sqrt(5.0) - 1.0) / 2.0  # its multiples fall evenly into [0, 1)
 
 
 @njit(cache=True)
