@@ -15,16 +15,17 @@ install: .venv/installed  ## make the virtual environment .venv with everything 
 
 demo: .venv/installed  ## build tables, validate and plot them, render the scenes small, all into demo/
 	mkdir -p demo
-	$(BIN)/tsdf-build sphere --eta 1.33 --joint 32 --out demo/sphere.tsdf.exr
+	$(BIN)/tsdf-build sphere --eta 1.33 --joint 32 --memory 64 --out demo/sphere.tsdf.exr
 	$(BIN)/tsdf-build sphere --eta 1.333 --fresnel sp --out demo/zhou2003.tsdf.exr --quiet
-	$(BIN)/tsdf-build snow --target-error 0.01 --joint 32 --out demo/snow.tsdf.exr
-	$(BIN)/tsdf-build sand --material quartz --target-error 0.02 --joint 32 --out demo/sand.tsdf.exr --quiet
-	$(BIN)/tsdf-build ellipsoid --set subdivisions=4 --material quartz --target-error 0.02 --joint 32 --out demo/clear.tsdf.exr --quiet
-	$(BIN)/tsdf-build sphere --eta 1.5 --joint 32 --out demo/glass.tsdf.exr --quiet
+	$(BIN)/tsdf-build snow --target-error 0.01 --joint 32 --memory 64 --out demo/snow.tsdf.exr
+	$(BIN)/tsdf-build sand --material quartz --target-error 0.02 --joint 32 --memory 64 --out demo/sand.tsdf.exr --quiet
+	$(BIN)/tsdf-build ellipsoid --set subdivisions=4 --material quartz --target-error 0.02 --joint 32 --memory 64 --out demo/clear.tsdf.exr --quiet
+	$(BIN)/tsdf-build sphere --eta 1.5 --joint 32 --memory 64 --out demo/glass.tsdf.exr --quiet
 	$(BIN)/tsdf-plot demo/sphere.tsdf.exr --out demo/sphere.png
 	$(BIN)/tsdf-plot demo/snow.tsdf.exr --out demo/snow.png
 	$(BIN)/tsdf-validate demo/zhou2003.tsdf.exr --plot demo/zhou2003.png
 	$(BIN)/tsdf-validate demo/sphere.tsdf.exr demo/snow.tsdf.exr demo/sand.tsdf.exr demo/clear.tsdf.exr demo/glass.tsdf.exr
+	$(BIN)/tsdf-accuracy demo/sphere.tsdf.exr --out demo/accuracy --seconds 60 --quiet
 	$(MAKE) --no-print-directory pictures INTO=demo WIDTH=320
 	@echo "tables, plots and pictures are in demo/"
 
@@ -36,11 +37,11 @@ pictures:
 	$(BIN)/python scenes/make_assets.py
 	$(BIN)/tsdf-render scenes/snow.toml --out $(INTO)/snow_heap.exr --width $(WIDTH) $(STOP)
 	$(BIN)/tsdf-render scenes/sand.toml --out $(INTO)/sand_dune.exr --width $(WIDTH) $(STOP)
-	for level in explicit teleport volume; do \
+	for level in explicit teleport-memory teleport; do \
 		$(BIN)/tsdf-render scenes/beads.toml --level $$level --out $(INTO)/beads_$$level.exr --width $(WIDTH) \
 			$(STOP) || exit; done
-	$(BIN)/python scenes/side_by_side.py $(INTO)/beads_explicit.exr $(INTO)/beads_teleport.exr \
-		$(INTO)/beads_volume.exr $(INTO)/beads.png
+	$(BIN)/python scenes/side_by_side.py $(INTO)/beads_explicit.exr $(INTO)/beads_teleport-memory.exr \
+		$(INTO)/beads_teleport.exr $(INTO)/beads.png
 	$(BIN)/python scenes/plate.py $(INTO)/snow_heap.png $(INTO)/sand_dune.png $(INTO)/beads_explicit.png $(INTO)/scenes.png
 
 test: .venv/installed  ## run the tests

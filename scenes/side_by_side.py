@@ -1,6 +1,6 @@
-"""Pictures of one scene at the levels explicit, teleport and volume, and how far the last two are from the first.
+"""Pictures of one scene at the levels explicit, teleport-memory and teleport, and how far the last two are from the first.
 
-    python scenes/side_by_side.py EXPLICIT.exr TELEPORT.exr VOLUME.exr OUT.png [EXPOSURE]
+    python scenes/side_by_side.py EXPLICIT.exr MEMORY.exr TELEPORT.exr OUT.png [EXPOSURE]
 
 Prints, and writes under each error image, the difference of the pictures' means and the mean of |difference|, both over
 the mean of the explicit picture, and what of the latter is expected from noise alone.
@@ -17,7 +17,7 @@ import numpy as np
 from tsdf import image
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, ITU-R BT.709
-NAMES = ("explicit", "teleport", "volume")
+NAMES = ("explicit", "teleport-memory", "teleport")
 
 
 class Difference(NamedTuple):
@@ -48,7 +48,7 @@ def difference(one: image.Image, truth: image.Image) -> Difference:
 
 
 def side_by_side(pictures: Sequence[Path], out: Path, exposure: float = 0.0) -> tuple[Difference, Difference]:
-    """Write the plate of three pictures (explicit, teleport, volume) as PNG and return the differences of the last two
+    """Write the plate of three pictures (explicit, teleport-memory, teleport) as PNG and return the differences of the last two
     to the first."""
     import colour
     from matplotlib.backends.backend_agg import FigureCanvasAgg

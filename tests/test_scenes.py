@@ -18,9 +18,9 @@ from tsdf.scatterometer import Effort, exact_sphere
 
 FOLDER = Path(make_assets.__file__).parent
 LEVELS = {
-    "snow": ("teleport", "volume"),
-    "sand": ("teleport", "volume"),
-    "beads": ("explicit", "teleport", "volume"),
+    "snow": ("teleport", "teleport-memory", "volume"),
+    "sand": ("teleport", "teleport-memory", "volume"),
+    "beads": ("explicit", "teleport-memory", "teleport"),
 }
 
 
@@ -33,7 +33,7 @@ def assets(tmp_path_factory):
 
 @cache
 def ball():
-    return exact_sphere(load_grain("sphere"), Optics(1.5), Effort(cells=256, joint=32))
+    return exact_sphere(load_grain("sphere"), Optics(1.5), Effort(cells=256, joint=32, memory=16))
 
 
 def loaded(name, folder, width):
