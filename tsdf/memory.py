@@ -24,8 +24,6 @@ from tsdf.table import Table
 from tsdf.vectors import KERNEL, cross, dot, frame, step, triple
 from tsdf.walker import DIM, EVENTS, OTHER, PATIENCE, TRUNCATED, cast, copy, halves, lives, write
 
-ODDS = 16  # cells along each axis of the density of entries given the exit
-BLUR = 1.5  # standard deviation by which that density is smoothed [cell]
 AIMED = 16  # records of each column of cos theta that light aimed at a lamp is drawn from
 
 
@@ -41,9 +39,8 @@ class Memory(NamedTuple):
     (c,): records of the light that met it, in the frame (side of the entry, d x side, d): direction, side of the exit,
     impact parameter of the exit, path length.
 
-    For light that is aimed: odds (m, ODDS, ODDS, ODDS): density of entries given the exit, over that of unrelated
-    spheres; aimed (all columns of cos theta, AIMED) int32: numbers column k + record; entered (c, columns, k) float32:
-    impact parameter of their entry; met (c,): hit probability.
+    For light that is aimed: aimed (all columns of cos theta, AIMED) int32: numbers column k + record; entered (c,
+    columns, k) float32: impact parameter of their entry; met (c,): hit probability.
     """
 
     law: np.ndarray
@@ -56,7 +53,6 @@ class Memory(NamedTuple):
     columns: np.ndarray
     grains: np.ndarray
     kept: np.ndarray
-    odds: np.ndarray
     aimed: np.ndarray
     entered: np.ndarray
     met: np.ndarray
@@ -100,7 +96,6 @@ def begin(w, memory):
     a, c = frame(d)
     co, si = turned(u1)
     t = step(step((0.0, 0.0, 0.0), co, a), si, c)
-    w.b_left = -1.0
     if u0 < memory.fraction[m]:  # in a sphere, the oftener the longer its chord
         b2 = 1.0 - u2 ** (2.0 / 3.0)
         w.key += GOLDEN
@@ -122,20 +117,8 @@ def begin(w, memory):
     w.b = b
 
 
-@njit(forceinline=True, **KERNEL)
-def odds_of(memory, m, b_left, b, cosine):
-    """Return how much oftener than unrelated spheres the next is entered so; 1 where none was left."""
-    if b_left < 0.0:
-        return 1.0
-    i = min(int(b_left * b_left * ODDS), ODDS - 1)
-    j = min(int(b * b * ODDS), ODDS - 1)
-    k = min(int(math.acos(min(max(cosine, -1.0), 1.0)) * (ODDS / math.pi)), ODDS - 1)
-    return memory.odds[m, i, j, k]
-
-
 @njit(**KERNEL)
-def connect(w, amounts, m, c, p, d, left, b_left, key, share, bound, room, media, memory, tables, lights, shadow,
-            its_amounts):  # fmt: skip
+def connect(w, amounts, m, c, p, d, key, share, bound, room, media, memory, tables, lights, shadow, its_amounts):
     """Start in `shadow` light that arrives from a light and is deflected into the walker's path by a grain; return
     whether there is any.
 
@@ -168,9 +151,6 @@ def connect(w, amounts, m, c, p, d, left, b_left, key, share, bound, room, media
     size = math.sqrt(x * x + y * y)
     x, y = (x / size, y / size) if size > 1e-12 else (1.0, 0.0)
     t = upright(step(step((0.0, 0.0, 0.0), x, side), -y, cross(d, side)), d)
-    phase *= odds_of(memory, m, b_left, b, dot(left, t))
-    if not phase > 0.0:
-        return False
     radius = memory.radius[m]
     along = math.sqrt(max(0.0, 1.0 - b * b))
     centre = step(step(p, radius * along, d), -radius * b, t)
@@ -211,7 +191,6 @@ def roam(w, amounts, once, out, out_amounts, live, most, g, room, media, memory,
     """
     m = w.medium
     p, d, t, b, key, free = triple(w.p), triple(w.d), triple(w.t), w.b, w.key, w.free
-    left, b_left = triple(w.q), w.b_left
     radius, sampled = memory.radius[m], lights.sampled and not w.shadow
     first, last = media.first[m], media.first[m] + media.kinds[m] - 1
     mean, sure = media.free[m], room.whole[m] or room.kind[m] != MESH
@@ -219,7 +198,7 @@ def roam(w, amounts, once, out, out_amounts, live, most, g, room, media, memory,
     bound, fresh = clearance(g, m, p), True
     if free < 0.0:
         begin(w, memory)
-        t, b, key, free, b_left = triple(w.t), w.b, w.key, w.free, w.b_left
+        t, b, key, free = triple(w.t), w.b, w.key, w.free
     while True:
         if not once and bound <= free:
             if not fresh:
@@ -245,8 +224,8 @@ def roam(w, amounts, once, out, out_amounts, live, most, g, room, media, memory,
             share = min(1.0, math.exp((2.0 * radius - bound) / mean))
             key += GOLDEN
             if unit(mix(key)) < share:
-                live += connect(w, amounts, m, c, p, d, left, b_left, key, share, bound, room, media, memory, tables,
-                                lights, out[live], out_amounts[live])  # fmt: skip
+                live += connect(w, amounts, m, c, p, d, key, share, bound, room, media, memory, tables, lights,
+                                out[live], out_amounts[live])  # fmt: skip
 
         # Is there a grain in this sphere, and is it met?
         along = math.sqrt(max(0.0, 1.0 - b * b))
@@ -273,12 +252,11 @@ def roam(w, amounts, once, out, out_amounts, live, most, g, room, media, memory,
         else:
             met += 1
             u = unit(bits)
-            odds = odds_of(memory, m, b_left, b, dot(left, t)) if sampled else 1.0
             grain = memory.grains[c, column, int(u * memory.kept[c])]
             up = cross(d, t)
             x, y, z = float(grain[0]), float(grain[1]), float(grain[2])
             if sampled:
-                pdf = memory.met[c] * odds * density(tables, column_of(tables, c, z)) if x != 0.0 or y != 0.0 else -1.0
+                pdf = memory.met[c] * density(tables, column_of(tables, c, z)) if x != 0.0 or y != 0.0 else -1.0
             new = step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d)
             half = 1.5 - 0.5 * dot(new, new)
             new = (new[0] * half, new[1] * half, new[2] * half)
@@ -295,7 +273,6 @@ def roam(w, amounts, once, out, out_amounts, live, most, g, room, media, memory,
                 luck += absorption.least[slot] * length
             key += GOLDEN
             bits = mix(key)
-        left, b_left = t, b
         gap, t, b = onward(memory, m, d, t, b, bits)
         free = radius * (through + gap)
         if luck < DIM:
@@ -316,8 +293,7 @@ def roam(w, amounts, once, out, out_amounts, live, most, g, room, media, memory,
     write(w.p, p)
     write(w.d, d)
     write(w.t, t)
-    write(w.q, left)
-    w.b, w.b_left, w.key, w.free, w.luck, w.pdf = b, b_left, key, free, luck, pdf
+    w.b, w.key, w.free, w.luck, w.pdf = b, key, free, luck, pdf
     return live, state
 
 
@@ -374,19 +350,6 @@ def _aimed(table: Table, most: int) -> np.ndarray:
     return result
 
 
-def _odds(law: Law) -> np.ndarray:
-    """Return the density of entries given the exit, (ODDS, ODDS, ODDS) by squared impact parameters of exit and entry
-    and azimuth, over that of unrelated spheres; of mean 1 for each exit."""
-    from scipy.ndimage import gaussian_filter
-
-    cells = law.gap.shape[0]
-    b_left2 = np.broadcast_to(((np.arange(cells) + 0.5) / cells)[:, None], law.gap.shape)
-    sample = np.stack((b_left2.ravel(), law.entry_b2.ravel(), law.azimuth.ravel() / math.pi), axis=1)
-    counts = np.histogramdd(sample, bins=(ODDS,) * 3, range=((0.0, 1.0),) * 3)[0]
-    smooth = gaussian_filter(counts, BLUR, mode="reflect")
-    return np.asarray(smooth / smooth.mean(axis=(1, 2), keepdims=True))
-
-
 def memory_of(
     laws: Sequence[Law],
     fractions: Sequence[float],
@@ -408,13 +371,12 @@ def memory_of(
     most = max((law.gap.shape[1] for law in laws), default=1)
     cells = laws[0].gap.shape[0] if laws else 1
     law = np.zeros((media, cells, most, 4), np.float32)
-    gaps, odds = np.zeros((media, cells * most + 1)), np.ones((media, ODDS, ODDS, ODDS))
+    gaps = np.zeros((media, cells * most + 1))
     for m, one in enumerate(laws):
         k = one.gap.shape[1]
         law[m, :, :k] = np.stack((one.gap, np.sqrt(one.entry_b2), np.cos(one.azimuth), np.sin(one.azimuth)), axis=-1)
         gaps[m, 1:] = np.cumsum(law[m, :, :, 0].astype(np.float64))
         gaps[m] /= gaps[m, -1]
-        odds[m] = _odds(one)
     columns = [len(table.hit) for table in tables]
     kept = [len(table.memory["l"]) for table in tables]
     shape = (len(tables), max(columns, default=1), max(kept, default=1))
@@ -436,7 +398,6 @@ def memory_of(
         columns=np.array(columns, np.int64),
         grains=records,
         kept=np.array(kept, np.int64),
-        odds=odds,
         aimed=np.concatenate(aimed),
         entered=entered,
         met=np.array([table.statistics["hit_probability"] for table in tables], np.float64),

@@ -27,7 +27,7 @@ MODELS = {
 WALKER = np.dtype(
     [("p", "3f8"), ("d", "3f8"), ("q", "3f8"), ("e", "3f8"), ("t", "3f8"), ("colour", "3f8"), ("weight", "f8"),
      ("luck", "f8"), ("pdf", "f8"), ("free", "f8"), ("length", "f8"), ("gained", "f8"), ("skip", "f8"), ("b", "f8"),
-     ("b_left", "f8"), ("key", "u8"), ("grain", "u8"),
+     ("key", "u8"), ("grain", "u8"),
      ("events", "i8"), ("sample", "i4"), ("ray", "i4"), ("medium", "i4"), ("mode", "i4"), ("component", "i4"),
      ("facet", "i4"), ("state", "i4"), ("tries", "i4"), ("shadow", "i4")]
 )  # fmt: skip
@@ -35,8 +35,7 @@ WALKER = np.dtype(
 # adds to the amounts; in a grain, q is its centre, e where the ray starts. luck: logarithm of a bound of the
 # throughput. pdf: density per steradian with which d was drawn, -1 for none. free: the free path still to fly, < 0 if
 # not drawn. skip: how far beyond p the ray engine starts. ray: row of the ray engine's answers, -1 for none. t, b: of
-# the bounding sphere at the end of the free path, the side on which it is entered and the impact parameter [R]; q,
-# b_left: the same of the one that was left, b_left < 0 if none is remembered.
+# the bounding sphere at the end of the free path, the side on which it is entered and the impact parameter [R].
 FLY, JUMP, GRAIN = 0, 1, 2
 UNKNOWN = -2  # medium of a walker that may have crossed a boundary
 
