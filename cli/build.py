@@ -143,7 +143,7 @@ class Bar:
     default="0",
     metavar="K",
     show_default=True,
-    help="Records per cell of entry, which level teleport-memory draws from.",
+    help="Records per cell of entry, which level teleport-memory draws from; 64 are many enough.",
 )
 @click.option(
     "--seed", callback=_count, default="0", metavar="N", show_default=True, help="Seed of the random numbers."

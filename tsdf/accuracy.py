@@ -34,6 +34,7 @@ from tsdf.experiment import follow as follow
 from tsdf.experiment import slab as slab
 from tsdf.explicit import exemplar
 from tsdf.medium import MAX_PACKING_FRACTION
+from tsdf.packing import MAX
 from tsdf.scene import LEVELS, Absorption, GrainSpec
 from tsdf.table import Table
 
@@ -183,6 +184,10 @@ def measure(
         In one line. A level that is impossible, at one packing fraction or at all, becomes a note instead.
     """
     table = _checked(grain, fractions, layers, levels, packings, seconds, paths)
+    if min(fractions) > MAX:
+        raise UsageError(
+            f"packing fraction {min(fractions):g}: random packings, which levels are held against, end at {MAX}"
+        )
     if paths is None and seconds is None:
         seconds = SECONDS
     exemplar(grain, table, name)  # explicit has to find it
@@ -495,7 +500,7 @@ def _worst(a: Accuracy) -> list[str]:
         some = [row for row in own if row.quantity == "time"]
         cells.append(f"{some[0].value:.2f} ± {some[0].error:.2g}" if some else "-")
         lines.append(f"| {' | '.join(cells)} |")
-    return ["The largest deviations, errors taken off:", "", *lines]
+    return ["Of each kind the deviation that lies farthest beyond its error:", "", *lines]
 
 
 def _deviation(row: Row) -> str:

@@ -446,22 +446,24 @@ def _calibrate(
     fields = [MEMORY_FIELDS.index(name) for name in means]
     tilt, target = np.zeros(len(fields)), np.array(list(means.values()))
     lit = [c for c in range(len(found)) if len(found[c])]
+    every = np.concatenate([found[c][:, fields] for c in lit] or [np.zeros((1, len(fields)))])
+    unit = np.maximum(every.std(axis=0), 1e-12)
     for _ in range(8):
         mean, spread = np.zeros(len(fields)), np.zeros((len(fields), len(fields)))
         for c in lit:
-            x = found[c][:, fields]
-            w = weights[c] * np.exp((x - target) @ tilt)
+            x = (found[c][:, fields] - target) / unit
+            w = weights[c] * np.exp(x @ tilt)
             w *= hit[c] / w.sum()
             own = w @ x
             mean += own
             spread += (x * w[:, None]).T @ x - np.outer(own, own) / hit[c]
-        total = hit[lit].sum()
-        step = np.linalg.lstsq(spread / total, target - mean / total, rcond=1e-9)[0]
-        tilt = tilt + step
+        if np.abs(mean).max() < 1e-9 * hit.sum():
+            break
+        tilt = tilt - np.linalg.lstsq(spread, mean, rcond=1e-9)[0]
         if not (np.abs(tilt) < 1.0).all():
             return
     for c in lit:
-        weights[c] = weights[c] * np.exp((found[c][:, fields] - target) @ tilt)
+        weights[c] = weights[c] * np.exp((found[c][:, fields] - target) / unit @ tilt)
 
 
 def _in_equal_cells(counts: np.ndarray, columns: int) -> np.ndarray:

@@ -117,7 +117,7 @@ def _batch(world: World, camera: T.Camera, first: int, paths: int, seed: int, ma
         places[number, passed[number]] = place[number] = those["p"]
         way[number], weight[number], amounts[number] = those["d"], those["weight"], mine.amounts[1][gone]
         passed[number] += 1
-        again = (passed[number] < marks) & (those["events"] >= world.media.limit)
+        again = (passed[number] < marks) & (those["events"] >= world.media.limit) & (those["weight"] > 0.0)
         more = int(again.sum())
         if more:
             those["events"], those["ray"] = 0, W.NONE
@@ -195,12 +195,12 @@ class Sums:
 
     @property
     def mean(self) -> np.ndarray:
-        return np.asarray(self.total) / self.paths
+        return np.asarray(self.total) / max(self.paths, 1)
 
     @property
     def error(self) -> np.ndarray:
         """Standard errors of the means."""
-        variance = np.maximum(np.asarray(self.squares) / self.paths - self.mean**2, 0.0)
+        variance = np.maximum(np.asarray(self.squares) / max(self.paths, 1) - self.mean**2, 0.0)
         return np.asarray(np.sqrt(variance / max(self.paths - 1, 1)))
 
     @property
@@ -226,10 +226,11 @@ def gather(
             continue
         assert seconds is not None
         spent = time.perf_counter() - began
-        left = (seconds - spent) / spent * sums.paths
-        if left < 0.2 * sums.paths:
+        done = sums.paths + sums.lost
+        left = (seconds - spent) / spent * done
+        if left < 0.2 * done or not sums.paths:
             break
-        size = max(1, min(GROWTH * sums.paths, MOST // e.marks, int(left)))
+        size = max(1, min(GROWTH * done, MOST // e.marks, int(left)))
     return sums
 
 

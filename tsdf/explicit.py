@@ -258,9 +258,7 @@ def packed(scene: Scene, tables: Sequence[Table]) -> Packed:
     Raises
     ------
     SceneError
-        A grain that cannot be found.
-    UsageError
-        A packing fraction beyond what random packings reach.
+        A grain that cannot be found, a packing fraction beyond what random packings reach.
     """
     cells, centres, notes = [], [], []
     share, eta, kept_apart, chosen = [], [], [], []

@@ -403,7 +403,7 @@ def place(scene: Scene, grains: bool = False) -> Place:
         solid=bool(solid),
     )
     made = Place(arrays, engines, first_facet, centre, boundaries, surfaces, room, tuple(notes))
-    _no_overlap(made, scene)
+    _no_overlap(made, scene, grains)
     return made
 
 
@@ -526,7 +526,7 @@ def distances(corners: np.ndarray, low: np.ndarray, step: float, counts: Sequenc
     return np.maximum(bounds, 0.0).astype(np.float32)
 
 
-def _no_overlap(made: Place, scene: Scene) -> None:
+def _no_overlap(made: Place, scene: Scene, single: bool) -> None:
     """Refuse media that share room: no model says what a place in two of them is."""
     count = len(scene.media)
     if count < 2:
@@ -554,6 +554,11 @@ def _no_overlap(made: Place, scene: Scene) -> None:
             if both.any():
                 at = "({:.4g}, {:.4g}, {:.4g})".format(*(points[both][0] + made.centre))
                 a, b = scene.media[j].name, scene.media[i].name
+                if "centres" in (scene.media[i].inside, scene.media[j].inside) and single:
+                    raise SceneError(
+                        f"{scene.name}: grains of media {a!r} and {b!r} reach into each other, at {at} for one, for "
+                        'only their centres are inside; leave room between the media, or say inside = "grains"'
+                    )
                 raise SceneError(
                     f"{scene.name}: media {a!r} and {b!r} overlap, at {at} for one; move or cut one of them"
                 )

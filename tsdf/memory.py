@@ -221,7 +221,8 @@ def roam(w, amounts, once, out, out_amounts, live, most, g, room, media, memory,
         if sampled:
             if bound < 8.0 * mean:
                 bound = max(bound, clearance(g, m, p))
-            share = min(1.0, math.exp((2.0 * radius - bound) / mean))
+            # The root of how likely the shadow is to arrive: it ends at a grain or not at all, and so costs least
+            share = min(1.0, math.exp(0.5 * (2.0 * radius - bound) / mean))
             key += GOLDEN
             if unit(mix(key)) < share:
                 live += connect(w, amounts, m, c, p, d, key, share, bound, room, media, memory, tables, lights,
@@ -256,7 +257,9 @@ def roam(w, amounts, once, out, out_amounts, live, most, g, room, media, memory,
             up = cross(d, t)
             x, y, z = float(grain[0]), float(grain[1]), float(grain[2])
             if sampled:
-                pdf = memory.met[c] * density(tables, column_of(tables, c, z)) if x != 0.0 or y != 0.0 else -1.0
+                pdf = memory.met[c] * density(tables, column_of(tables, c, z))
+                if not pdf > 0.0 or (x == 0.0 and y == 0.0):
+                    pdf = -1.0
             new = step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d)
             half = 1.5 - 0.5 * dot(new, new)
             new = (new[0] * half, new[1] * half, new[2] * half)

@@ -5,7 +5,7 @@ impact parameter b_o^2 = 1 - (n_o . d)^2. What comes next is a record: the gap t
 parameter b_i^2 of its entry, and psi, the azimuth about d between the tangential parts of the exit's and the entry's
 normal, in [0, pi], for its sign is random. This is a property of the packing alone, whatever stands in its spheres.
 Lengths are in units of the bounding radius R. The file that holds such tables is laid down in ``schema/PACKING.md``;
-how light uses them is `transport`.
+how light uses them is `memory`.
 """
 
 import math

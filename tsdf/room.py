@@ -147,20 +147,20 @@ def stand(room, m, centres, result):
 
 @njit(cache=True)
 def _listed(corners, reach, low, edge, counts, first, facets):
-    """Count the facets within reach of each cell in first[1:], or with room for them write them to `facets`."""
+    """Count the facets within their reach of each cell in first[1:], or with room for them write them to `facets`."""
     half = math.sqrt(0.75) * edge
     at = first[:-1].copy()
     ends = np.empty((3, 2), np.int64)
     for f in range(len(corners)):
         for k in range(3):
             a, b, c = corners[f, 0, k], corners[f, 1, k], corners[f, 2, k]
-            ends[k, 0] = max(0, math.floor((min(a, b, c) - reach - low[k]) / edge))
-            ends[k, 1] = min(counts[k], math.floor((max(a, b, c) + reach - low[k]) / edge) + 1)
+            ends[k, 0] = max(0, math.floor((min(a, b, c) - reach[f] - low[k]) / edge))
+            ends[k, 1] = min(counts[k], math.floor((max(a, b, c) + reach[f] - low[k]) / edge) + 1)
         for i in range(ends[0, 0], ends[0, 1]):
             for j in range(ends[1, 0], ends[1, 1]):
                 for k in range(ends[2, 0], ends[2, 1]):
                     p = (low[0] + (i + 0.5) * edge, low[1] + (j + 0.5) * edge, low[2] + (k + 0.5) * edge)
-                    if triangle_distance(corners[f], p) > reach + half:
+                    if triangle_distance(corners[f], p) > reach[f] + half:
                         continue
                     cell = (i * counts[1] + j) * counts[2] + k
                     if len(facets):
@@ -196,9 +196,14 @@ def room_of(
                     np.zeros((media + 1, 0), bool), np.zeros(3), 1.0, np.zeros(3, np.int64))  # fmt: skip
     corners = np.concatenate([c for _, c, _ in meshes])
     owner = np.repeat([o for o, _, _ in meshes], [len(c) for _, c, _ in meshes]).astype(np.int32)
-    reach = float(radius.max())
-    low, high = corners.min(axis=(0, 1)) - 1.01 * reach, corners.max(axis=(0, 1)) + 1.01 * reach
+    # Surfaces matter to every medium's grains, a boundary to its own, and if these may stick out, only which side it is
+    reach = np.append(np.where(whole, radius, 0.0), [radius.max()] * 2)[owner]
+    margin = 1.01 * radius.max()
+    low, high = corners.min(axis=(0, 1)) - margin, corners.max(axis=(0, 1)) + margin
     edge = max(float(((high - low).prod() / CELLS) ** (1 / 3)), 0.5 * float(radius.min()))
+    while np.ceil((high - low) / edge + 1.0).prod() > 2 * CELLS:  # a flat grid has cells to spare
+        edge *= 1.1
+    low = low - edge * np.array([0.017, 0.029, 0.041])  # so that no middle of a cell lies on a facet along an axis
     counts = np.ceil((high - low) / edge).astype(np.int64)
     first = np.zeros(int(counts.prod()) + 1, np.int64)
     _listed(corners, reach, low, edge, counts, first, np.zeros(0, np.int32))
@@ -206,8 +211,9 @@ def room_of(
     facets = np.zeros(int(first[-1]), np.int32)
     _listed(corners, reach, low, edge, counts, first, facets)
     inside = np.zeros((media + 1, int(counts.prod())), bool)
-    middles = low + (np.stack(np.unravel_index(np.arange(inside.shape[1]), counts), axis=1) + 0.5) * edge
+    if (owner != OPEN).any():
+        middles = low + (np.stack(np.unravel_index(np.arange(inside.shape[1]), counts), axis=1) + 0.5) * edge
     for number, _, within in meshes:
-        if number != OPEN:
-            inside[number if number >= 0 else media] |= within(middles)
+        if number != OPEN:  # bodies that overlap count as often as facets between two places do
+            inside[number if number >= 0 else media] ^= within(middles)
     return Room(kind, shape, radius, whole, balls, corners, owner, first, facets, inside, low, edge, counts)

@@ -3,7 +3,7 @@
 A walker is one sample of one pixel, followed backwards from the camera. All levels share its states: it flies straight,
 it jumps from where light enters a grain's bounding sphere to where it leaves it, or it is in a grain of the explicit
 level. Deep inside a medium, farther from everything than the next event can take it, it takes step after step without
-the ray engine. A shadow is a walker that flies toward a light and only loses weight.
+the ray engine. A shadow is a walker that flies toward a light and loses weight or ends on its way.
 
 The rules at boundaries are those of Meng et al. 2015 (supplemental): a jump that meets a surface ends there, as an
 ordinary surface vertex; one that leaves the medium ends on its boundary, which is index-matched. No point is ever moved
@@ -296,7 +296,7 @@ def wander(w, amounts, once, out, out_amounts, live, most, g, media, tables, lig
     write(w.p, p)
     write(w.d, d)
     w.key, w.free, w.luck, w.pdf = key, free, luck, pdf
-    if w.events >= media.limit:
+    if state != 2 and w.events >= media.limit:
         counters[TRUNCATED] += 1
         state = 2
     return live, state
@@ -404,6 +404,7 @@ def again(w, slack, counters):
     w.tries += 1
     if w.tries > TRIES:
         counters[FAULTS] += 1
+        w.weight = 0.0
         return ENDED
     return LOOK_AGAIN
 
@@ -602,8 +603,8 @@ def advance(count, walkers, amounts, out, out_amounts, hits, grain_hits, starts,
 
     What goes on is written to out and out_amounts, the rays it needs to starts and ways (n, 3) float32, and for the
     exemplars to grain_starts and grain_ways (e, n, 3). What has ended stays in `walkers`, the number of its sample
-    inverted (~sample), of weight 0 unless it left the scene or reached the limit of events. `asked` (2 + e,) int64
-    receives the numbers of walkers, of rays and of rays by exemplar.
+    inverted (~sample); but for shadows, its weight is 0 unless it left the scene or reached the limit of events.
+    `asked` (2 + e,) int64 receives the numbers of walkers, of rays and of rays by exemplar.
     """
     live, rays = 0, 0
     for i in range(asked.shape[0]):

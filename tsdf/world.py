@@ -181,7 +181,7 @@ def build(scene: Scene, level: str) -> World:
     memory = _memory(scene, tables if model == TELEPORT_MEMORY else [])
     for number, (medium, boundary) in enumerate(zip(scene.media, made.boundaries, strict=True), 1):
         extent = _extent(medium, boundary.vertices if boundary is not None else None)
-        if 2.0 * medium.radius > extent:
+        if 2.0 * medium.radius > extent and medium.inside == "grains":
             notes.append(
                 f"{scene.name}: [[medium]] {number} ({medium.name}): a grain of diameter {2.0 * medium.radius:g} does "
                 f"not fit into the medium, which is {extent:.3g} thin"
