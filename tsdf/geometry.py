@@ -354,7 +354,7 @@ def place(scene: Scene, grains: bool = False) -> Place:
     balls = [(i, s.shape) for i, s in enumerate(scene.surfaces) if isinstance(s.shape, Sphere)]
     places = np.array([[*(np.array(b.centre) - centre), b.radius] for _, b in balls]).reshape(-1, 4)
     room = room_of(kind, _moved(kind, shape, np.where(whole, -radii, 0.0)), radii, whole, places,
-                   _walls(boundaries, surfaces) if grains else [])  # fmt: skip
+                   _walls(boundaries, surfaces) if grains else [], (low - centre, high - centre))  # fmt: skip
     if grains:
         out = np.where(whole, 0.0, radii)
         shape = _moved(kind, shape, out)

@@ -177,6 +177,7 @@ def room_of(
     whole: np.ndarray,
     balls: np.ndarray,
     meshes: Sequence[tuple[int, np.ndarray, Any]],
+    extent: tuple[np.ndarray, np.ndarray],
 ) -> Room:
     """Return the room for grains in a scene.
 
@@ -187,6 +188,9 @@ def room_of(
     meshes : sequence of (owner, corners, within)
         Facets (f, 3, 3) of each boundary and surface, and for those that are closed what says of points (n, 3) whether
         they are inside.
+    extent : two (3,) arrays
+        Corners of a box that holds all media that have an end; the grid is laid there, and where there are endless
+        media, wherever there are facets.
     """
     media = len(kind)
     meshes = [(owner, corners, within) for owner, corners, within in meshes if len(corners)]
@@ -199,7 +203,10 @@ def room_of(
     # Surfaces matter to every medium's grains, a boundary to its own, and if these may stick out, only which side it is
     reach = np.append(np.where(whole, radius, 0.0), [radius.max()] * 2)[owner]
     margin = 1.01 * radius.max()
-    low, high = corners.min(axis=(0, 1)) - margin, corners.max(axis=(0, 1)) + margin
+    low, high = extent
+    if (kind == SLAB).any():
+        low, high = np.minimum(low, corners.min(axis=(0, 1))), np.maximum(high, corners.max(axis=(0, 1)))
+    low, high = low - margin, high + margin
     edge = max(float(((high - low).prod() / CELLS) ** (1 / 3)), 0.5 * float(radius.min()))
     while np.ceil((high - low) / edge + 1.0).prod() > 2 * CELLS:  # a flat grid has cells to spare
         edge *= 1.1
