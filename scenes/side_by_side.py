@@ -1,4 +1,4 @@
-"""Pictures of one scene at the levels explicit, teleport-memory and teleport, and how far the last two are from the first.
+"""Pictures of one scene at the levels explicit, teleport-memory and teleport, and how far these are from the first.
 
     python scenes/side_by_side.py EXPLICIT.exr MEMORY.exr TELEPORT.exr OUT.png [EXPOSURE]
 
@@ -48,8 +48,8 @@ def difference(one: image.Image, truth: image.Image) -> Difference:
 
 
 def side_by_side(pictures: Sequence[Path], out: Path, exposure: float = 0.0) -> tuple[Difference, Difference]:
-    """Write the plate of three pictures (explicit, teleport-memory, teleport) as PNG and return the differences of the last two
-    to the first."""
+    """Write the plate of three pictures (explicit, teleport-memory, teleport) as PNG and return the differences of the
+    last two to the first."""
     import colour
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
