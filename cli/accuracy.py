@@ -1,11 +1,10 @@
 """``tsdf-accuracy``: a table in, the error of every level in bulk and in slabs out."""
 
-import signal
 from pathlib import Path
 
 import click
 
-from tsdf.cli.common import Tool, plain
+from tsdf.cli.common import Tool, make_folder, plain, watched
 from tsdf.cli.render import LEVELS
 
 MEASURED = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume")
@@ -63,39 +62,20 @@ def main(
     if not 0 <= seed < 2**63:
         raise UsageError(f"--seed is a whole number from 0 to 2^63 - 1, not {seed}")
 
-    from tqdm import tqdm
-
     from tsdf import accuracy, format, plots
     from tsdf.files import replacing
     from tsdf.scene import GrainSpec
 
     read = format.read(table)
+    make_folder(out)
     try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise TSDFError(f"--out {plain(out)}: cannot be made: {error.strerror}; give a folder") from None
-
-    def stop(*_: object) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # signals come twice, and the second is no other
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, stop)
-    form = "{percentage:3.0f}% |{bar}| {postfix} [{elapsed}]"
-    try:
-        with tqdm(total=1.0, disable=quiet or None, bar_format=form, dynamic_ncols=True) as bar:
-
-            def progress(share: float, word: str) -> None:
-                bar.set_postfix_str(word, refresh=False)
-                bar.update(share - bar.n)
-
+        with watched(quiet) as progress:
             found = accuracy.measure(
                 GrainSpec(read, mesh=mesh), packing, layer, chosen, packings, seconds, paths, seed, threads, progress,
                 plain(table.name),
             )  # fmt: skip
     except SceneError as error:
         raise TSDFError(f"{error} (--mesh FILE)" if mesh is None else str(error)) from None
-    finally:
-        signal.signal(signal.SIGTERM, before)
     for name, text in (("accuracy.md", accuracy.markdown(found)), ("accuracy.csv", accuracy.csv_text(found))):
         with replacing(out / name) as temporary:
             temporary.write_text(text, encoding="utf-8")

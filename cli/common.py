@@ -6,9 +6,11 @@ failed, 2 the request cannot be meant, 130 interrupted. Nothing slow is imported
 
 import contextlib
 import os
+import signal
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 import click
@@ -72,3 +74,39 @@ class Tool(click.Command):
         with contextlib.suppress(OSError):
             click.echo(f"{self.name}: {kind}: {plain(message)}", err=True)
         return status
+
+
+def make_folder(out: Path) -> None:
+    """Make the folder that --out names, if it is not there.
+
+    Raises
+    ------
+    TSDFError
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TSDFError(f"--out {plain(out)}: cannot be made: {error.strerror}; give a folder") from None
+
+
+@contextlib.contextmanager
+def watched(quiet: bool) -> Iterator[Callable[[float, str], None]]:
+    """Show a progress bar, to be told the share done and a word, and let SIGTERM interrupt as Ctrl-C does."""
+    from tqdm import tqdm
+
+    def stop(*_: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # signals come twice, and the second is no other
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    form = "{percentage:3.0f}% |{bar}| {postfix} [{elapsed}]"
+    try:
+        with tqdm(total=1.0, disable=quiet or None, bar_format=form, dynamic_ncols=True) as bar:
+
+            def progress(share: float, word: str) -> None:
+                bar.set_postfix_str(word, refresh=False)
+                bar.update(share - bar.n)
+
+            yield progress
+    finally:
+        signal.signal(signal.SIGTERM, before)

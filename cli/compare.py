@@ -1,12 +1,11 @@
 """``tsdf-compare``: a scene in, the error and the time of every level out."""
 
-import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from tsdf.cli.common import Tool, plain
+from tsdf.cli.common import Tool, make_folder, plain, watched
 from tsdf.cli.render import LEVELS, save
 
 if TYPE_CHECKING:
@@ -45,7 +44,7 @@ def main(
     """
     from difflib import get_close_matches
 
-    from tsdf.errors import TSDFError, UsageError
+    from tsdf.errors import UsageError
 
     chosen = [name.strip() for name in levels.split(",")] if levels is not None else list(LEVELS)
     for name in chosen:
@@ -59,40 +58,21 @@ def main(
     if seed is not None and not 0 <= seed < 2**63:
         raise UsageError(f"--seed is a whole number from 0 to 2^63 - 1, not {seed}")
 
-    from tqdm import tqdm
-
     from tsdf import compare, plots
     from tsdf.files import replacing
     from tsdf.scene import load, resized
 
     read = resized(load(scene), width)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise TSDFError(f"--out {plain(out)}: cannot be made: {error.strerror}; give a folder") from None
+    make_folder(out)
 
     def keep(name: str, world: "World", picture: "Picture", own: int) -> None:
         save(world, picture, own, out / f"{name}.exr")
 
-    def stop(*_: object) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # signals come twice, and the second is no other
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, stop)
-    form = "{percentage:3.0f}% |{bar}| {postfix} [{elapsed}]"
-    try:
-        with tqdm(total=1.0, disable=quiet or None, bar_format=form, dynamic_ncols=True) as bar:
-
-            def progress(share: float, word: str) -> None:
-                bar.set_postfix_str(word, refresh=False)
-                bar.update(share - bar.n)
-
-            found = compare.compare(
-                read, chosen, spp, seconds, reference_seconds, packings, read.render.seed if seed is None else seed,
-                threads, progress, keep,
-            )  # fmt: skip
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    with watched(quiet) as progress:
+        found = compare.compare(
+            read, chosen, spp, seconds, reference_seconds, packings, read.render.seed if seed is None else seed,
+            threads, progress, keep,
+        )  # fmt: skip
     for name, text in (("levels.md", compare.markdown(found)), ("levels.csv", compare.csv_text(found))):
         with replacing(out / name) as temporary:
             temporary.write_text(text, encoding="utf-8")
