@@ -28,7 +28,7 @@ MEASURED = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume
 @click.option("--mesh", type=click.Path(path_type=Path), metavar="FILE", help="Of a grain that is not built in.")
 @click.option(
     "--seconds", type=float, metavar="S",
-    help="About the time of it all, but for packings that have to be made first.  [default: 300]",
+    help="Time of measuring, after a start that makes packings and compiles once for this machine.  [default: 300]",
 )  # fmt: skip
 @click.option("--paths", type=int, metavar="N", help="Paths of each slab, level and packing instead.")
 @click.option("--packings", type=int, default=4, metavar="K", show_default=True, help="Packings behind explicit.")

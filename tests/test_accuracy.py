@@ -15,7 +15,7 @@ from tsdf import accuracy, experiment, plots
 from tsdf.accuracy import diffusion, measure, slab
 from tsdf.cli.accuracy import main
 from tsdf.errors import SceneError, UsageError
-from tsdf.experiment import Sums, gather, slab_experiment
+from tsdf.experiment import Experiment, Sums, gather, slab_experiment
 from tsdf.grains import load_grain
 from tsdf.medium import Component, volume_parameters
 from tsdf.optics import Optics
@@ -266,21 +266,40 @@ def test_grains_that_let_no_light_in_have_no_absorbing_slabs() -> None:
     assert any("left out" in note for note in found.notes)
 
 
-@pytest.mark.parametrize("calls", [1, 3, 12])
-def test_interruption_keeps_what_is_done(calls: int, grain: GrainSpec) -> None:
-    count = 0
+@pytest.mark.parametrize(("word", "rows"), [("start: packing 1", 0), ("bulk, volume", 0), ("layer of 2 R at 0", 3)])
+def test_interruption_keeps_what_is_done(word: str, rows: int, grain: GrainSpec) -> None:
+    """At any step what came before it stays: nothing at the start, the bulk's three levels at the first slab."""
 
-    def progress(share: float, word: str) -> None:
-        nonlocal count
+    def progress(share: float, now: str) -> None:
         assert 0.0 <= share <= 1.0
-        count += 1
-        if count == calls:
+        if word in now:
             raise KeyboardInterrupt
 
     found = measure(grain, [0.5], [2.0], ["teleport", "volume"], paths=64, progress=progress)
     assert found.interrupted
     assert "Interrupted" in accuracy.markdown(found)
-    assert len(found.rows) == {1: 0, 3: 0, 12: 2}[calls] or calls == 12
+    assert len(found.rows) == rows
+
+
+def test_time_is_kept_on_the_clock(grain: GrainSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A start of 1000 s (of a clock that leaps whenever a packing is made) costs the measuring nothing, and runs that
+    take ten times their share leave less to the next: asked for 60 s, all runs together are given no more."""
+    clock, given = [0.0], []
+    monkeypatch.setattr(accuracy.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(accuracy, "pack", lambda *_: clock.__setitem__(0, clock[0] + 250.0))
+
+    def slow(made: Experiment, paths: int | None, seconds: float | None = None, *_: object, **__: object) -> Sums:
+        if seconds is not None:
+            given.append(seconds)
+            clock[0] += 10.0 * max(seconds, 0.0)
+        return gather(made, 2, threads=1)
+
+    monkeypatch.setattr(accuracy, "gather", slow)
+    found = measure(grain, [0.05], [2.0], ["teleport"], seconds=60.0)
+    assert "60 s of measuring follow a start of 1000.0 s" in found.notes
+    assert given[0] == pytest.approx(60.0 * accuracy.BULK / 5)
+    assert clock[0] - 1000.0 < 60.0 + 10.0 * max(given)
+    assert min(given) < 0.0
 
 
 @pytest.mark.parametrize(

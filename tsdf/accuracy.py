@@ -4,10 +4,12 @@ What is measured is `experiment`; here it is done for every level, fraction and 
 the paths and from the spread over packings. Errors of whole pictures are `compare`'s, charts `plots`'.
 """
 
+import contextlib
 import csv
 import io
 import math
 import statistics
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import NamedTuple
@@ -21,6 +23,7 @@ from tsdf.experiment import (
     BLOCKS,
     MOST_CUTS,
     PROFILE,
+    SPHERES,
     Experiment,
     Sums,
     block_of,
@@ -34,7 +37,7 @@ from tsdf.experiment import follow as follow
 from tsdf.experiment import slab as slab
 from tsdf.explicit import exemplar
 from tsdf.medium import MAX_PACKING_FRACTION
-from tsdf.packing import MAX
+from tsdf.packing import MAX, pack
 from tsdf.scene import LEVELS, Absorption, GrainSpec
 from tsdf.table import Table
 
@@ -168,7 +171,8 @@ def measure(
     packings : int
         Behind explicit, 4 to 100.
     seconds : float, optional
-        About the time of it all, but for packings that have to be made first [s]; 300 if paths are not given either.
+        About the time of it all on the clock, after a start in which packings are made and kernels compiled [s]; 300 if
+        paths are not given either. What the start took is a note.
     paths : int, optional
         Paths of each slab and level instead, of explicit in each packing; a bulk has as many blocks of events.
     seed : int
@@ -201,6 +205,7 @@ def measure(
     shown = min(fractions, key=lambda f: abs(f - SHOWN))
     rows, interrupted = [], False
     try:
+        run.start(fractions)
         for number, case in enumerate(cases):
             rows += run.case(case, number, len(fractions), len(cases))
         rows += run.times(shown)
@@ -261,6 +266,7 @@ class _Run:
     notes: list[str]
     levels: tuple[str, ...]
     done: float = 0.0
+    began: float = 0.0
 
     def __post_init__(self) -> None:
         self.block = block_of(self.table)
@@ -273,6 +279,28 @@ class _Run:
     def left(self, coefficient: float) -> float:
         """Return by how much the albedo of a grain that absorbs is above what is asked for."""
         return self.table.albedo(coefficient) / self.table.albedo() - ALBEDO
+
+    def start(self, fractions: Sequence[float]) -> None:
+        """Make what is made once for this machine, packings and kernels, outside the time, and say what that took."""
+        began = time.perf_counter()
+        missing = [(f, k) for f in fractions if f <= MAX for k in range(self.packings)]
+        for number, (f, k) in enumerate(missing, 1):
+            self.told(0.0, f"start: packing {number} of {len(missing)}")
+            with contextlib.suppress(TSDFError):  # told where it is used
+                pack(f, SPHERES, k)
+        self.told(0.0, "start: kernels, compiled once for this machine")
+        made = self.possible("explicit", fractions[0], lambda: bulk_experiment("explicit", self.grain, fractions[0]))
+        if made is not None:
+            gather(made, 1, threads=1)
+        self.began = time.perf_counter()
+        if self.seconds is not None:
+            self.notes.append(f"{self.seconds:g} s of measuring follow a start of {self.began - began:.1f} s")
+
+    def time(self, share: float) -> float | None:
+        """Return what a share of the time is, less what is overspent already [s]; None where paths are counted."""
+        if self.seconds is None:
+            return None
+        return min(share * self.seconds, self.began + self.done * self.seconds - time.perf_counter())
 
     def told(self, share: float, word: str) -> None:
         """Say that something is begun, which is a share of the whole."""
@@ -317,25 +345,26 @@ class _Run:
 
     def one(self, level: str, case: _Case, packing: int, top: float, share: float, number: int) -> Sums | None:
         """Return what a level makes of a case in one packing; None where it is impossible."""
-        f, seconds = case.fraction, self.seconds and share * self.seconds
+        f = case.fraction
         seed = (self.seed + 1 + MOST_RUNS * LEVELS.index(level) + number) % LARGEST_SEED
         if math.isnan(case.layer):
             made = self.possible(level, f, lambda: bulk_experiment(level, self.grain, f, packing, self.block))
             paths = self.paths and max(16, self.paths // BLOCKS)
-            return gather(made, paths, seconds, seed, self.threads) if made else None
+            return gather(made, paths, self.time(share), seed, self.threads) if made else None
         cosine, several = math.cos(math.radians(case.angle_deg)), self.coefficients
         if level not in MOVED:
             made = self.possible(
                 level, f, lambda: slab_experiment(level, self.grain, f, case.layer, cosine, packing, several, top)
             )
-            return gather(made, self.paths, seconds, seed, self.threads) if made else None
+            return gather(made, self.paths, self.time(share), seed, self.threads) if made else None
         each = []
         for k, c in enumerate(several):
             grain = replace(self.grain, absorption=Absorption("grey", (c,)))
             made = self.possible(level, f, lambda grain=grain: slab_experiment(level, grain, f, case.layer, cosine))  # type: ignore[misc]
             if made is None:
                 return None
-            each.append(gather(made, self.paths, seconds and seconds / len(several), seed + k, self.threads))
+            seconds = self.time(share / len(several))
+            each.append(gather(made, self.paths, seconds, seed + k, self.threads))
         return _beside(each)
 
     def times(self, fraction: float) -> list[Row]:
@@ -358,7 +387,7 @@ class _Run:
             for level, one in made.items():
                 self.told(share, f"time per event, {level}")
                 paths = self.paths and max(16, self.paths // BLOCKS)
-                taken[level] = gather(one, paths, self.seconds and share * self.seconds, k, self.threads).event
+                taken[level] = gather(one, paths, self.time(share), k, self.threads).event
             for level, event in taken.items():
                 ratios[level].append(event / taken["teleport"])
         rows = []
