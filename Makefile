@@ -13,27 +13,39 @@ help:  ## list the targets
 
 install: .venv/installed  ## make the virtual environment .venv with everything in it
 
-demo: .venv/installed  ## build tables, validate and plot them, render the scenes small, all into demo/
+demo: .venv/installed  ## tables of two kinds, plotted and validated, and one small picture at two levels, into demo/
+	@echo "make demo: two tables and the published sphere (20 s), their plots and validation (20 s), glass beads grain by"
+	@echo "grain and by teleportation, kernels compiled first (60 s on two cores). make gallery has everything else."
 	mkdir -p demo
-	$(BIN)/tsdf-build sphere --eta 1.33 --joint 32 --memory 64 --out demo/sphere.tsdf.exr
+	$(BIN)/tsdf-build sphere --eta 1.5 --joint 32 --memory 64 --out demo/glass.tsdf.exr
+	$(BIN)/tsdf-build snow --paths 1e6 --out demo/grain.tsdf.exr
 	$(BIN)/tsdf-build sphere --eta 1.333 --fresnel sp --out demo/zhou2003.tsdf.exr --quiet
-	$(BIN)/tsdf-build snow --target-error 0.01 --joint 32 --memory 64 --out demo/snow.tsdf.exr
-	$(BIN)/tsdf-build sand --material quartz --target-error 0.02 --joint 32 --memory 64 --out demo/sand.tsdf.exr --quiet
-	$(BIN)/tsdf-build ellipsoid --set subdivisions=4 --material quartz --target-error 0.02 --joint 32 --memory 64 --out demo/clear.tsdf.exr --quiet
-	$(BIN)/tsdf-build sphere --eta 1.5 --joint 32 --memory 64 --out demo/glass.tsdf.exr --quiet
-	$(BIN)/tsdf-plot demo/sphere.tsdf.exr --out demo/sphere.png
-	$(BIN)/tsdf-plot demo/snow.tsdf.exr --out demo/snow.png
+	$(BIN)/tsdf-plot demo/glass.tsdf.exr --out demo/glass.png
+	$(BIN)/tsdf-plot demo/grain.tsdf.exr --out demo/grain.png
+	$(BIN)/tsdf-validate demo/glass.tsdf.exr demo/grain.tsdf.exr
 	$(BIN)/tsdf-validate demo/zhou2003.tsdf.exr --plot demo/zhou2003.png
-	$(BIN)/tsdf-validate demo/sphere.tsdf.exr demo/snow.tsdf.exr demo/sand.tsdf.exr demo/clear.tsdf.exr demo/glass.tsdf.exr
-	$(BIN)/tsdf-accuracy demo/sphere.tsdf.exr --out demo/accuracy --seconds 60 --quiet
-	$(MAKE) --no-print-directory pictures INTO=demo WIDTH=320
-	@echo "tables, plots and pictures are in demo/"
+	$(BIN)/python scenes/make_assets.py
+	for level in explicit teleport-memory; do \
+		$(BIN)/tsdf-render scenes/beads.toml --level $$level --out demo/beads_$$level.exr --width 320 --spp 32 || exit; done
+	$(BIN)/python scenes/side_by_side.py demo/beads_explicit.exr demo/beads_teleport-memory.exr demo/beads.png
+	@echo "look at demo/*.png: glass and grain (tables), zhou2003 (a published curve), beads (two levels)"
 
-gallery: demo  ## render the scenes large into gallery/; SECONDS=900 is the time for each picture
+tables: .venv/installed  ## build the tables that the scenes name, into demo/
+	mkdir -p demo
+	$(BIN)/tsdf-build sphere --eta 1.5 --joint 32 --memory 64 --out demo/glass.tsdf.exr --quiet
+	$(BIN)/tsdf-build sphere --eta 1.33 --joint 32 --memory 64 --out demo/sphere.tsdf.exr --quiet
+	$(BIN)/tsdf-build snow --target-error 0.01 --joint 32 --memory 64 --out demo/snow.tsdf.exr
+	$(BIN)/tsdf-build sand --material quartz --target-error 0.02 --joint 32 --memory 64 --out demo/sand.tsdf.exr
+	$(BIN)/tsdf-build ellipsoid --set subdivisions=4 --material quartz --target-error 0.02 --joint 32 --memory 64 --out demo/clear.tsdf.exr
+	$(BIN)/tsdf-validate demo/glass.tsdf.exr demo/sphere.tsdf.exr demo/snow.tsdf.exr demo/sand.tsdf.exr demo/clear.tsdf.exr
+
+gallery: tables  ## the scenes large and the chart of errors, into gallery/; SECONDS=900 is the time for each picture
 	mkdir -p gallery
+	$(BIN)/tsdf-plot demo/snow.tsdf.exr --out gallery/snow.png
+	$(BIN)/tsdf-accuracy demo/sphere.tsdf.exr --out gallery/accuracy --seconds 300 --quiet
 	$(MAKE) --no-print-directory pictures INTO=gallery WIDTH=1280 STOP="--seconds $(or $(SECONDS),900)"
 
-pictures:
+pictures: .venv/installed
 	$(BIN)/python scenes/make_assets.py
 	$(BIN)/tsdf-render scenes/snow.toml --out $(INTO)/snow_heap.exr --width $(WIDTH) $(STOP)
 	$(BIN)/tsdf-render scenes/sand.toml --out $(INTO)/sand_dune.exr --width $(WIDTH) $(STOP)
@@ -57,4 +69,4 @@ bench: .venv/installed  ## measure speed and error side by side, into bench/
 	$(BIN)/python benchmarks/bench_sampler.py
 	$(BIN)/python benchmarks/bench_render.py
 
-.PHONY: help install demo gallery pictures test check bench
+.PHONY: help install demo tables gallery pictures test check bench

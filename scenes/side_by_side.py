@@ -1,11 +1,12 @@
-"""Pictures of one scene at the levels explicit, teleport-memory and teleport, and how far these are from the first.
+"""Pictures of one scene at several levels, and how far all others are from the first.
 
-    python scenes/side_by_side.py EXPLICIT.exr MEMORY.exr TELEPORT.exr OUT.png [EXPOSURE]
+    python scenes/side_by_side.py TRUTH.exr OTHER.exr ... OUT.png
 
 Prints, and writes under each error image, the difference of the pictures' means and the mean of |difference|, both over
-the mean of the explicit picture, and what of the latter is expected from noise alone.
+the mean of the first picture, and what of the latter is expected from noise alone.
 """
 
+import json
 import math
 import sys
 from collections.abc import Sequence
@@ -17,7 +18,6 @@ import numpy as np
 from tsdf import image
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, ITU-R BT.709
-NAMES = ("explicit", "teleport-memory", "teleport")
 
 
 class Difference(NamedTuple):
@@ -47,43 +47,47 @@ def difference(one: image.Image, truth: image.Image) -> Difference:
     )
 
 
-def side_by_side(pictures: Sequence[Path], out: Path, exposure: float = 0.0) -> tuple[Difference, Difference]:
-    """Write the plate of three pictures (explicit, teleport-memory, teleport) as PNG and return the differences of the
-    last two to the first."""
+def level_of(picture: image.Image) -> str:
+    """Return the level that a picture of `tsdf-render` was made at."""
+    return str(json.loads(picture.attributes.get("tsdf_render", "{}")).get("level", "another"))
+
+
+def side_by_side(pictures: Sequence[Path], out: Path) -> list[tuple[str, Difference]]:
+    """Write the plate of pictures as PNG and return the level of each but the first, and its difference to that."""
     import colour
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     truth, *others = shown = [image.read_exr(path) for path in pictures]
-    found = [difference(one, truth) for one in others]
+    found = [(level_of(one), difference(one, truth)) for one in others]
     height, width = truth.rgb.shape[:2]
-    figure = Figure(figsize=(12.0, 8.0 * height / width + 1.2), layout="constrained")
+    figure = Figure(figsize=(4.0 * len(shown), 8.0 * height / width + 1.2), layout="constrained")
     FigureCanvasAgg(figure)
-    top, bottom = figure.subplots(2, 3)
-    for axes, name, one in zip(top, NAMES, shown, strict=True):
-        axes.imshow(colour.cctf_encoding(np.clip(one.rgb.astype(np.float64) * 2.0**exposure, 0.0, 1.0)))
-        axes.set_title(name)
-    most = float(np.quantile([one.per_pixel for one in found], 0.99))
-    for axes, name, one in zip(bottom[1:], NAMES[1:], found, strict=True):
+    top, bottom = figure.subplots(2, len(shown))
+    for axes, one in zip(top, shown, strict=True):
+        axes.imshow(colour.cctf_encoding(np.clip(one.rgb.astype(np.float64), 0.0, 1.0)))
+        axes.set_title(level_of(one))
+    most = float(np.quantile([one.per_pixel for _, one in found], 0.99))
+    for axes, (name, one) in zip(bottom[1:], found, strict=True):
         plate = axes.imshow(one.per_pixel, vmin=0.0, vmax=most, cmap="magma")
         axes.set_title(
-            f"|{name} - explicit|\nmean {one.error:.1%} (noise {one.noise:.1%}), of the means {one.bias:+.1%}",
+            f"|{name} - {level_of(truth)}|\nmean {one.error:.1%} (noise {one.noise:.1%}), of the means {one.bias:+.1%}",
             fontsize=9,
         )
     for axes in (*top, *bottom):
         axes.set_axis_off()
     bar = bottom[0].inset_axes((0.1, 0.5, 0.8, 0.08))
-    figure.colorbar(plate, cax=bar, orientation="horizontal", label="|difference| / mean of explicit, luminance")
+    label = f"|difference| / mean of {level_of(truth)}, luminance"
+    figure.colorbar(plate, cax=bar, orientation="horizontal", label=label)
     figure.savefig(out, dpi=80, metadata={"Software": None})
-    return found[0], found[1]
+    return found
 
 
 if __name__ == "__main__":
-    if len(sys.argv) not in (5, 6):
+    if len(sys.argv) < 4:
         raise SystemExit((__doc__ or "").split("\n\n")[1].strip())
-    results = side_by_side([Path(p) for p in sys.argv[1:4]], Path(sys.argv[4]), *map(float, sys.argv[5:]))
-    for level, result in zip(NAMES[1:], results, strict=True):
+    for level, result in side_by_side([Path(p) for p in sys.argv[1:-1]], Path(sys.argv[-1])):
         print(
-            f"{level}: mean {result.bias:+.2%} of explicit, mean |difference| {result.error:.2%} "
+            f"{level}: mean {result.bias:+.2%} of the first, mean |difference| {result.error:.2%} "
             f"(noise {result.noise:.2%})"
         )

@@ -135,8 +135,9 @@ def test_difference_tells_noise_from_error(tmp_path):
     other = difference(picture(1.1), truth)
     assert abs(other.bias - 0.1) < 4.0 * standard_error
     assert other.error - other.noise > 4.0 * standard_error
-    paths = [tmp_path / f"{k}.exr" for k in range(3)]
+    paths = [tmp_path / f"{level}.exr" for level in ("explicit", "teleport")]
     for path in paths:
-        image.write_exr(path, truth.rgb, truth.variance)
-    side_by_side(paths, tmp_path / "plate.png")
+        image.write_exr(path, truth.rgb, truth.variance, {"tsdf_render": f'{{"level": "{path.stem}"}}'})
+    ((level, none),) = side_by_side(paths, tmp_path / "plate.png")
+    assert level == "teleport" and none.error == 0.0 and none.noise > 0.0
     assert (tmp_path / "plate.png").stat().st_size > 1000
