@@ -1,7 +1,6 @@
 """The exact sphere against printed numbers, another program, a vector ray trace, itself by other routes."""
 
 import math
-import time
 from pathlib import Path
 
 import numpy as np
@@ -101,9 +100,7 @@ def test_phase_function_matches_the_reference_program(eta, name):
     text = (REFERENCE / f"gomsphere_n{name}.csv").read_text().splitlines()
     degrees, _, fine, sp, un = np.loadtxt([line for line in text if line[0].isdigit()], delimiter=",").T
     theta = np.radians(degrees)
-    started = time.perf_counter()
     ours = phase_function(theta, eta, "sp"), phase_function(theta, eta, "un")
-    assert time.perf_counter() - started < 10  # 0.7 s; compiling included on the first run
     for mine, reference in zip(ours, (sp, un), strict=True):
         ratio = mine / reference
         assert np.abs(ratio - 1).max() < 3e-9

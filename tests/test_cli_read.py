@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 import warnings
 from pathlib import Path
 
@@ -257,11 +256,9 @@ def installed(name, *arguments, **options):
 
 @pytest.mark.parametrize("name", ["tsdf-info", "tsdf-plot", "tsdf-validate"])
 def test_installed_commands(name, tmp_path):
-    """Each answers --help fast, and a missing file without a traceback."""
-    started = time.perf_counter()
+    """Each answers --help, and a missing file without a traceback."""
     helped = installed(name, "--help")
     assert helped.returncode == 0 and "Usage: " + name in helped.stdout
-    assert time.perf_counter() - started < 2.0  # 0.2 s on a quiet machine
     options = ["--out", tmp_path / "a.png"] if name == "tsdf-plot" else []
     done = installed(name, tmp_path / "missing", *options)
     assert done.returncode == 1 and "Traceback" not in done.stderr + done.stdout

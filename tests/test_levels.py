@@ -126,23 +126,25 @@ def agree(a: Measured, b: Measured, sigmas: float = SIGMAS) -> bool:
 @pytest.mark.parametrize(
     "fraction, thickness, truth, teleported, volume",
     [
-        (0.3, 12.0, 0.161, 0.150, 0.164),
-        (0.5, 12.0, 0.254, 0.253, 0.273),
-        (0.5, 42.0, 0.627, 0.641, 0.654),
-        (0.6, 12.0, 0.286, 0.297, 0.319),
-        (0.6, 42.0, 0.656, 0.682, 0.696),
+        (0.3, 12.0, 0.154, 0.150, 0.164),
+        (0.5, 12.0, 0.248, 0.253, 0.273),
+        (0.5, 42.0, 0.628, 0.641, 0.654),
+        (0.6, 12.0, 0.285, 0.297, 0.319),
+        (0.6, 42.0, 0.660, 0.682, 0.696),
     ],
 )
 def test_slabs_of_packed_spheres(
     ball: Table, sky: Path, fraction: float, thickness: float, truth: float, teleported: float, volume: float
 ) -> None:
-    """Reflectances computed by another program; its VPT flies 4R/3f on average, where lambda_b + lambda_s is meant.
+    """Reflectances computed apart from this test; that of VPT flies 4R/3f on average, where lambda_b + lambda_s is
+    meant.
 
-    Grains are whole inside the explicit slab, so the homogeneous one is 2 R thinner. The last check, that the two free
-    paths differ by more than twice the tolerance at f > 0.3, is the negative control.
+    Explicit: means of several packings (at f = .6 an independent program, polarised, has .2854(14) and .6555(18)); one
+    packing is .002 off them. Grains are whole inside the explicit slab, so the homogeneous one is 2 R thinner. The last
+    check, that the two free paths differ by more than twice the tolerance at f > 0.3, is the negative control.
     """
-    found = slab("explicit", fraction, thickness, ball, sky, 20_000)
-    assert abs(found.rgb[0] - truth) < 0.010 + found.error[0]
+    found = slab("explicit", fraction, thickness, ball, sky, 40_000)
+    assert abs(found.rgb[0] - truth) < SIGMAS * math.hypot(found.error[0], 0.002)
     homogeneous = scene_of(Slab(2.0 - thickness, 0.0), fraction, ball, EnvironmentLight(sky))
     for level in ("teleport", "teleport-joint"):
         found = seen(world.build(homogeneous, level), 60_000)
