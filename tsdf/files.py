@@ -1,15 +1,35 @@
-"""Writing a file whole or not at all."""
+"""Writing a file whole or not at all, and finding out beforehand whether it can be written.
 
+A file is written under a hidden name beside its own, `.NAME.HEX.tmp`, then moved. Its writer holds a lock on it, which
+ends with the process, so that the next one to write NAME can tell what a killed process left and take it away.
+"""
+
+import contextlib
+import glob
 import os
 import secrets
+import stat
+import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from tsdf.errors import TSDFError
 
+try:
+    from fcntl import LOCK_EX, LOCK_NB, flock
+except ImportError:  # a system without such locks leaves what killed processes left
+    flock = None  # type: ignore[assignment]
 
-@contextmanager
+STALE_S = 60.0  # [s] younger temporary files are left alone: their lock may be about to be taken
+PROBE = bytes(65536)  # what a disk must have room for before any work is done
+MAX_NAME = 255  # [bytes] of the name of a file on common file systems
+
+whole = threading.RLock()  # held while files are written that nothing tidies up: take it before ending the process
+_open: set[Path] = set()  # temporary files of this process
+
+
+@contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path beside `path` to write to, and move what is there to `path` if nothing was raised.
 
@@ -22,17 +42,90 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         For any OSError, in one line.
     """
     try:
-        target = Path(os.path.realpath(path))
-        if target.exists() and not target.is_file():
-            raise OSError("there is something other than a regular file")
-        temporary = target.with_name(f".{secrets.token_hex(8)}.tmp")
-        try:
+        target = _target(path)
+        sweep(target)
+        with _temporary(target) as temporary:
             yield temporary
             os.replace(temporary, target)
-        finally:
-            temporary.unlink(missing_ok=True)
     except OSError as error:
         reason = error.strerror or error
         raise TSDFError(
             f"cannot write {os.fspath(path)}: {reason}; check the folder, the permissions and the free space"
         ) from error
+
+
+def probe(path: str | os.PathLike[str]) -> None:
+    """Find out whether `path` can be written, as far as that can be known, by writing a little beside it.
+
+    Raises
+    ------
+    OSError
+    """
+    target = _target(path)
+    with _temporary(target) as temporary:
+        temporary.write_bytes(PROBE)
+    folder = target.parent.stat()
+    if (
+        target.exists()
+        and folder.st_mode & stat.S_ISVTX
+        and os.getuid() not in (0, folder.st_uid, target.stat().st_uid)
+    ):
+        raise PermissionError("it belongs to another user, in a folder where only owners replace files")
+
+
+def discard() -> None:
+    """Remove the temporary files of this process, which is about to end."""
+    for path in tuple(_open):
+        with contextlib.suppress(OSError):
+            path.unlink()
+
+
+def sweep(target: Path) -> None:
+    """Remove what processes that were killed while they wrote `target` have left beside it."""
+    if flock is None:
+        return
+    with contextlib.suppress(OSError):
+        for path in list(target.parent.glob(f"{glob.escape(_stem(target))}.*.tmp")):
+            with contextlib.suppress(OSError), open(path, "rb") as file:
+                if time.time() - os.fstat(file.fileno()).st_mtime > STALE_S:
+                    flock(file, LOCK_EX | LOCK_NB)  # refused while its writer lives
+                    path.unlink()
+
+
+def _target(path: str | os.PathLike[str]) -> Path:
+    """Return where a file really is, or will be.
+
+    Raises
+    ------
+    OSError
+        For what is there and not a regular file, or for a name that is too long.
+    """
+    target = Path(os.path.realpath(path))
+    with contextlib.suppress(FileNotFoundError):
+        if not stat.S_ISREG(target.stat().st_mode):
+            raise OSError("there is something other than a regular file")
+    return target
+
+
+def _stem(target: Path) -> str:
+    """Return how the names of a file's temporary files begin."""
+    room = MAX_NAME - len("..0123456789abcdef.tmp")
+    return "." + os.fsencode(target.name)[:room].decode(errors="ignore")
+
+
+@contextlib.contextmanager
+def _temporary(target: Path) -> Iterator[Path]:
+    """Give an empty file beside `target`, locked, which is not there any more afterwards."""
+    path = target.with_name(f"{_stem(target)}.{secrets.token_hex(8)}.tmp")
+    _open.add(path)
+    try:
+        with open(path, "xb") as file:
+            if flock is None:
+                file.close()  # such a system moves no open files
+            else:
+                with contextlib.suppress(OSError):  # a file system without locks
+                    flock(file, LOCK_EX | LOCK_NB)
+            yield path
+    finally:
+        path.unlink(missing_ok=True)
+        _open.discard(path)
