@@ -18,11 +18,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legval
 from numpy.typing import ArrayLike, NDArray
 
+from tsdf.compiled import njit
 from tsdf.errors import UsageError
 
 Array = NDArray[np.float64]
@@ -39,7 +39,7 @@ ETA = (0.01, 100.0)  # beyond, light stays inside for more orders than can be su
 _PANELS = np.concatenate([np.linspace(0, 1, 33)[:-1], 1 - 0.5 ** np.arange(6, 40), [1.0]]) * (np.pi / 2)
 _NODES, _WEIGHTS = leggauss(12)
 
-_jit = numba.njit(cache=True, error_model="numpy")
+_jit = njit(cache=True, error_model="numpy")
 
 
 # --- geometry and Fresnel of one ray ------------------------------------------------------------------------

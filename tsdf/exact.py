@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from tsdf import analytic
 from tsdf import tally as T
+from tsdf.compiled import njit
 from tsdf.errors import UsageError
 from tsdf.estimate import (
     LEGENDRE,

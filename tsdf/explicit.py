@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from tsdf.compiled import njit
 from tsdf.errors import SceneError, TSDFError
 from tsdf.geometry import planes_of
 from tsdf.grains import Grain, embree_scene, grain_from_mesh, load_grain, read_mesh

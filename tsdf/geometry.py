@@ -14,8 +14,8 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from tsdf.compiled import njit
 from tsdf.errors import GrainError, SceneError
 from tsdf.grains import first_hit, grain_from_mesh, read_mesh, triangle_scene
 from tsdf.room import BALL, BOX, CLOSED, MESH, OPEN, SLAB, Room, exact_depth, room_of

@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from tsdf.compiled import njit
 from tsdf.vectors import cross, dot, step, triple
 
 UNKNOWN = 2.0  # horizon of a facet of which nothing is promised: no sine exceeds it

@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from tsdf.compiled import njit
 from tsdf.errors import UsageError
 from tsdf.sampling import turn
 from tsdf.vectors import KERNEL, frame, step

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from tsdf.compiled import njit
 from tsdf.geometry import clearance
 from tsdf.lights import draw as draw_light
 from tsdf.neighbours import Law

@@ -18,9 +18,9 @@ from importlib import resources
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from tsdf import container
+from tsdf.compiled import njit
 from tsdf.container import Broken, Format
 from tsdf.errors import UsageError
 from tsdf.estimate import software

@@ -7,8 +7,7 @@ the hit at hand, n_transmitted / n_incident.
 import math
 from dataclasses import dataclass
 
-from numba import njit
-
+from tsdf.compiled import njit
 from tsdf.errors import UsageError
 
 UNPOLARISED, S, P = 0, 1, 2

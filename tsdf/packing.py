@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from tsdf.compiled import njit
 from tsdf.errors import TSDFError, UsageError
 from tsdf.files import replacing
 from tsdf.sampling import key_of, mix, unit

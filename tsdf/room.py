@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from tsdf.compiled import njit
 from tsdf.vectors import KERNEL, cross, dot, step
 
 CELLS = 1_000_000  # of the grid, about: fewer where a cell would be smaller than a grain

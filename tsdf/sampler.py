@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from tsdf.compiled import njit
 from tsdf.errors import UsageError
 from tsdf.table import Table
 from tsdf.vectors import frame

@@ -6,7 +6,8 @@ numba kernels; uint64 keys stand for random streams. Nothing here keeps a state,
 import math
 
 import numpy as np
-from numba import njit
+
+from tsdf.compiled import njit
 
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: the step of SplitMix64
 

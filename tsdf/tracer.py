@@ -18,9 +18,9 @@ from functools import lru_cache
 from threading import Event
 
 import numpy as np
-from numba import njit
 
 from tsdf import tally as T
+from tsdf.compiled import njit
 from tsdf.grains import Grain, embree_scene
 from tsdf.horizon import UNKNOWN, horizon_of
 from tsdf.optics import UNPOLARISED, fresnel

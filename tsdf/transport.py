@@ -14,10 +14,9 @@ matter crossed and becomes colour when light is found, for all wavelengths at on
 import math
 from typing import NamedTuple
 
-from numba import njit
-
 from tsdf import explicit as X
 from tsdf import memory as M
+from tsdf.compiled import njit
 from tsdf.geometry import MESH, NONE, ball_hit, clearance, exact_hit, facet_hit
 from tsdf.lights import draw as draw_light
 from tsdf.lights import radiance as light_from

@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from numba import njit
+from tsdf.compiled import njit
 
 # Options of kernels that allocate nothing: without counting references, which takes two thirds of the time of a kernel
 # that is handed many arrays. Not a public option of numba's: without it, all works, only slower.

@@ -7,8 +7,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from tsdf.compiled import njit
 from tsdf.geometry import NONE
 from tsdf.sampling import mix, unit
 from tsdf.vectors import KERNEL, dot

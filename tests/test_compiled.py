@@ -1,0 +1,94 @@
+"""Machine code that is kept: never stale, never where others can write, and never a reason to stop."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tsdf import compiled
+from tsdf.compiled import PACKAGE, njit, private_folder
+
+INNER = "from tsdf.compiled import njit\n\nSCALE = {}\n\n@njit(cache=True)\ndef f(x):\n    return SCALE * x\n"
+OUTER = "from tsdf.compiled import njit\nfrom tsdf.inner import f\n\n@njit(cache=True)\ndef g(x):\n    return f(x)\n"
+RUN = "from tsdf.outer import g; print(g(1.0), sum(g.stats.cache_hits.values()), g._cache.cache_path)"
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """A small package of this name, of which one module calls a kernel of another."""
+    package = tmp_path / "tsdf"
+    package.mkdir()
+    for name in ("__init__", "errors", "files", "compiled"):
+        shutil.copy(PACKAGE / f"{name}.py", package)
+    (package / "inner.py").write_text(INNER.format(2.0))
+    (package / "outer.py").write_text(OUTER)
+    return package
+
+
+def run(package: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Call the outer kernel in a process of its own: its value, cache hits, and where it is kept."""
+    own = {name: value for name, value in os.environ.items() if not name.startswith(("NUMBA", "PYTHON", "XDG"))}
+    own |= {"PYTHONDONTWRITEBYTECODE": "1", **environment}
+    code = f"import sys; sys.path.insert(0, {str(package.parent)!r})\n{RUN}"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=own, check=True)
+
+
+def test_a_changed_callee_is_noticed(package: Path) -> None:
+    """An upgrade that changes a kernel's callee alone runs the new one; numba's own cache runs the old one."""
+    assert run(package).stdout.split()[:2] == ["2.0", "0"]
+    (package / "inner.py").write_text(INNER.format(3.0))
+    assert run(package).stdout.split() == ["3.0", "0", str(package / "__pycache__")]
+    (package / "unrelated.py").write_text("")
+    for file in package.glob("__pycache__/outer*.nbc"):
+        file.write_bytes(file.read_bytes()[:-100])
+    assert run(package).stdout.split()[:2] == ["3.0", "0"]  # damaged: compiled again
+    assert run(package).stdout.split()[:2] == ["3.0", "1"]
+
+
+def test_nowhere_to_keep_it(package: Path, tmp_path: Path) -> None:
+    """Neither beside the package (a file is in the way) nor in a home: a private folder, or none; one line each."""
+    (package / "__pycache__").write_text("in the way")
+    bare = {"HOME": "/proc/none", "TMPDIR": str(tmp_path)}
+    own = tmp_path / f"tsdf-{os.getuid()}"
+    for hits in "01":
+        done = run(package, **bare)
+        assert done.stdout.split()[:2] == ["2.0", hits] and done.stdout.split()[2].startswith(str(own))
+        assert done.stderr.count("NUMBA_CACHE_DIR") == 1 and str(own) in done.stderr
+    assert own.stat().st_mode & 0o777 == 0o700
+    own.chmod(0o777)  # others may have put in what they like
+    done = run(package, **bare)
+    assert done.stdout.split() == ["2.0", "0", "None"] and done.stderr.count("NUMBA_CACHE_DIR") == 1
+    named = run(package, NUMBA_CACHE_DIR=str(tmp_path / "named"), **bare)
+    assert named.stderr == "" and str(tmp_path / "named") in named.stdout
+
+
+def test_a_folder_of_another_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled.tempfile, "gettempdir", lambda: str(tmp_path))
+    path = tmp_path / f"tsdf-{os.getuid()}"
+    assert private_folder() == path
+    path.chmod(0o720)
+    assert private_folder() is None
+    path.rmdir()
+    path.symlink_to(tmp_path)
+    assert private_folder() is None
+    path.unlink()
+    path.write_text("")
+    assert private_folder() is None
+    path.unlink()
+    monkeypatch.setattr(compiled.os, "getuid", lambda: 12345)
+    (tmp_path / "tsdf-12345").mkdir(mode=0o700)
+    assert private_folder() is None or os.stat(tmp_path).st_uid == 12345
+
+
+def test_a_numba_without_the_private_option(monkeypatch: pytest.MonkeyPatch) -> None:
+    owner = next(one for one in compiled.cpu.CPUTargetOptions.__mro__ if "_nrt" in vars(one))
+    monkeypatch.delattr(owner, "_nrt")
+
+    @njit(_nrt=False, nogil=True)
+    def twice(x):
+        return 2 * x
+
+    assert twice(3) == 6

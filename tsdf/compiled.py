@@ -1,0 +1,145 @@
+"""The door to numba: kernels, and where their machine code is kept between runs.
+
+numba's own cache knows a kernel by the text of its file, not by that of the kernels it calls, so an upgrade that
+changes only those would leave old code running. Here a kernel is known by its file and all that this imports of the
+package. Where neither the package nor the home can be written to (farms, containers), numba gives up; here the code is
+kept in a folder of /tmp that nobody else can write to, for it is read back as it is, or else not at all.
+"""
+
+import contextlib
+import hashlib
+import os
+import re
+import stat
+import tempfile
+import warnings
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core import caching, cpu
+
+from tsdf.files import whole
+
+PACKAGE = Path(__file__).parent
+_IMPORTS = re.compile(r"^from tsdf(?:\.(\w+) import|\simport\s([^(\n]+|\([^)]*\)))", re.MULTILINE)
+
+
+def njit(**options: Any) -> Callable[[Any], Any]:
+    """Return what ``numba.njit`` does for these options; `cache` is kept as this module says."""
+    kept = options.pop("cache", False)
+    if not hasattr(cpu.CPUTargetOptions, "_nrt"):  # not a public option: without it, all works, only slower
+        options.pop("_nrt", None)
+
+    def compiled(function: Any) -> Any:
+        kernel = numba.njit(**options)(function)
+        if kept:
+            with contextlib.suppress(RuntimeError):  # nowhere to keep it, which `_fallback` has said
+                kernel._cache = _Cache(function)
+        return kernel
+
+    return compiled
+
+
+@cache
+def imported(name: str) -> frozenset[str]:
+    """Return the names of the modules of the package that a module is made of: itself, and all that it imports."""
+    found, waiting = set(), [name]
+    while waiting:
+        one = waiting.pop()
+        path = PACKAGE / f"{one}.py"
+        if one in found or not path.is_file():
+            continue
+        found.add(one)
+        for module, names in _IMPORTS.findall(path.read_text(encoding="utf-8")):
+            waiting += [module] if module else re.findall(r"(\w+)(?:\s+as\s+\w+)?\s*(?:,|\)|$)", names)
+    return frozenset(found)
+
+
+@cache
+def stamp(name: str) -> str:
+    """Return the SHA-256 of the text of a module and of all it imports of the package, in hexadecimal."""
+    digest = hashlib.sha256()
+    for one in sorted(imported(name)):
+        digest.update(hashlib.sha256((PACKAGE / f"{one}.py").read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def private_folder() -> Path | None:
+    """Return this user's folder for machine code among the temporary files, None where it could be another's."""
+    try:
+        path = Path(tempfile.gettempdir()) / f"tsdf-{os.getuid()}"
+        path.mkdir(mode=0o700, exist_ok=True)
+        found = path.lstat()
+    except (OSError, AttributeError):  # not a folder, no folder for temporary files, or a system without users
+        return None
+    mine = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077
+    return path if mine and os.access(path, os.W_OK) else None
+
+
+@cache
+def _fallback() -> Path | None:
+    """Return the folder for what nothing else can keep, and say so once."""
+    folder = private_folder()
+    where = f"kept in {folder} only" if folder else "not kept, and compiled again by every run"
+    warnings.warn(
+        f"compiled code is {where}, for neither the package nor the home can be written to; name a folder for it with "
+        "NUMBA_CACHE_DIR",
+        stacklevel=2,
+    )
+    return folder
+
+
+class _Stamped:
+    """A place for machine code, of numba's, known by all that a kernel is made of."""
+
+    _py_file: str
+
+    def get_source_stamp(self) -> str:
+        return stamp(Path(self._py_file).stem)
+
+
+class _Given(_Stamped, caching.UserProvidedCacheLocator):
+    """NUMBA_CACHE_DIR."""
+
+
+class _InTree(_Stamped, caching.InTreeCacheLocator):
+    """Beside the package."""
+
+
+class _UserWide(_Stamped, caching.UserWideCacheLocator):
+    """In the home."""
+
+
+class _Temporary(_Stamped, caching.InTreeCacheLocator):
+    """In a folder of /tmp."""
+
+    def __init__(self, function: Any, file: str) -> None:
+        super().__init__(function, file)
+        self._cache_path = os.path.join(_fallback() or "", self.get_suitable_cache_subpath(file))
+
+    @classmethod
+    def from_function(cls, function: Any, file: str) -> Any:
+        return super().from_function(function, file) if _fallback() else None
+
+
+class _Places(caching.CompileResultCacheImpl):
+    _locator_classes: Any = (_Given, _InTree, _UserWide, _Temporary)
+
+
+class _Cache(caching.FunctionCache):
+    """numba's cache, which a damaged file or a full disk does not stop: the kernel is compiled again."""
+
+    _impl_class = _Places
+
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        try:
+            return super().load_overload(signature, context)
+        except Exception:  # whatever unpickling makes of a damaged file
+            return None
+
+    def save_overload(self, signature: Any, data: Any) -> None:
+        with contextlib.suppress(OSError), whole:
+            super().save_overload(signature, data)
