@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
-from tsdf.cli.common import Tool, make_folder, plain, watched
-from tsdf.cli.render import LEVELS
+from tsdf.cli.common import Tool, check_folder, check_numbers, named_levels, plain, shown_progress
+from tsdf.cli.start import interrupt_status, interruptible
 
 MEASURED = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume")
 
@@ -47,31 +47,32 @@ def main(
     With --paths the same command gives the same numbers, but for times. Exit status 130 if interrupted, 1 if the table
     cannot be measured, 2 if the request cannot be meant.
     """
-    from difflib import get_close_matches
+    from tsdf.errors import SceneError, TSDFError
 
-    from tsdf.errors import SceneError, TSDFError, UsageError
-
-    chosen = [name.strip() for name in levels.split(",")] if levels is not None else list(MEASURED)
-    for name in chosen:
-        if name not in LEVELS:
-            near = get_close_matches(name, LEVELS, 1)
-            hint = f"did you mean {near[0]}?" if near else f"levels are {', '.join(LEVELS)}"
-            raise UsageError(f"--levels: no level {name!r}; {hint}")
-    if threads is not None and threads < 1:
-        raise UsageError(f"--threads is a whole number of at least 1, not {threads}")
-    if not 0 <= seed < 2**63:
-        raise UsageError(f"--seed is a whole number from 0 to 2^63 - 1, not {seed}")
+    chosen = named_levels(levels, MEASURED)
+    check_numbers(seed, threads=threads)
 
     from tsdf import accuracy, format, plots
     from tsdf.files import replacing
     from tsdf.scene import GrainSpec
 
     read = format.read(table)
-    make_folder(out)
+    meshes = [] if mesh is None else [mesh]
+    check_folder(out, ["accuracy.md", "accuracy.csv", "accuracy.png"], table, *meshes)
+    begun = False
     try:
-        with watched(quiet) as progress:
+        with (
+            shown_progress(quiet) as progress,
+            interruptible(lambda: None if begun else "nothing is written", raises=True),
+        ):
+
+            def told(share: float, word: str) -> None:
+                nonlocal begun
+                begun = begun or share > 0.0
+                progress(share, word)
+
             found = accuracy.measure(
-                GrainSpec(read, mesh=mesh), packing, layer, chosen, packings, seconds, paths, seed, threads, progress,
+                GrainSpec(read, mesh=mesh), packing, layer, chosen, packings, seconds, paths, seed, threads, told,
                 plain(table.name),
             )  # fmt: skip
     except SceneError as error:
@@ -85,4 +86,4 @@ def main(
         click.echo(accuracy.markdown(found), nl=False)
     if found.interrupted:
         click.echo(f"interrupted: {plain(out)} holds what was done", err=True)
-    return 130 if found.interrupted else 0
+    return interrupt_status() if found.interrupted else 0

@@ -1,18 +1,19 @@
 """``tsdf-build``: a grain in, a table out."""
 
 import os
-import signal
-import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from tsdf.cli.common import Tool
+from tsdf.cli.common import Progress, Tool, check_output, plain, shown_progress
+from tsdf.cli.start import interruptible
 from tsdf.errors import GrainError, TSDFError, UsageError
 
 if TYPE_CHECKING:
-    from tsdf.scatterometer import Build, Progress
+    from tsdf.scatterometer import Progress as Done
 
 DEFAULT_MATERIAL, DEFAULT_WAVELENGTH_NM = "ice", 550.0
 
@@ -63,48 +64,24 @@ def _setting(context: click.Context, parameter: click.Parameter, values: tuple[s
     return settings
 
 
-def check_output(out: Path, *inputs: Path) -> None:
-    """Refuse an output that cannot be written, or would replace an input, before any work is done for it.
+def told(progress: "Progress", target: float | None) -> Callable[["Done"], None]:
+    """Return what tells a progress bar of a build: paths, their rate, current error, and how far that is."""
+    begun: list[float] = []
 
-    Raises
-    ------
-    TSDFError
-    """
-    if not out.parent.is_dir():
-        raise TSDFError(f"cannot write {out}: {out.parent} is not a folder; make it, or choose another --out")
-    if out.exists() and not out.is_file():
-        raise TSDFError(f"cannot write {out}: it is not a regular file; choose another --out")
-    if out.exists() and any(path.exists() and path.samefile(out) for path in inputs):
-        raise TSDFError(f"cannot write {out}: it is an input; choose another --out")
-    if not os.access(out.parent, os.W_OK):
-        raise TSDFError(f"cannot write {out}: no permission in {out.parent}; choose another --out")
+    def tell(done: "Done") -> None:
+        begun[:] = begun or [time.monotonic(), done.paths]
+        total = done.total
+        words = [
+            f"{done.paths:.3g} paths, {(done.paths - begun[1]) / max(time.monotonic() - begun[0], 1e-9):.2g} paths/s"
+        ]
+        if done.error is not None:
+            words.append(f"total variation {done.error:.2g}, {done.cells} cells")
+            if target is not None and done.paths:
+                # noise falls as the square root of the paths: a guess of how many the target takes
+                total = int(done.paths * max(1.0, done.error / target) ** 2)
+        progress(done.paths / total if total else 0.0, ", ".join(words))
 
-
-class Bar:
-    """A progress bar on standard error: paths, rate, current error, time left."""
-
-    def __init__(self, target: float | None, quiet: bool) -> None:
-        from tqdm import tqdm
-
-        self._target = target
-        self._bar = tqdm(unit=" paths", unit_scale=True, disable=quiet, file=sys.stderr, dynamic_ncols=True)
-
-    def __call__(self, progress: "Progress") -> None:
-        bar = self._bar
-        if bar.n == 0:
-            bar.initial = progress.paths
-        bar.total = progress.total
-        if self._target is not None and progress.error is not None and progress.paths:
-            # noise falls as the square root of the paths: a guess of how many the target takes
-            bar.total = int(progress.paths * max(1.0, progress.error / self._target) ** 2)
-        if progress.error is not None:
-            bar.set_postfix_str(f"total variation {progress.error:.2g}, {progress.cells} cells", refresh=False)
-        bar.n = progress.paths
-        bar.refresh()
-
-    def close(self) -> None:
-        """Leave the bar as it is."""
-        self._bar.close()
+    return tell
 
 
 @click.command("tsdf-build", cls=Tool)
@@ -223,13 +200,14 @@ def main(
     else:
         optics = Optics(eta, fresnel)
     effort = scatterometer.Effort(paths, target_error, cells, joint, seed, max_bounces, memory)
-    check_output(out, Path(grain))
     part_file = out if part is not None else out.with_name(out.name + ".part")
+    check_output(out, Path(grain), beside=[] if exact or part is not None else [part_file])
     if not exact and part_file.exists() and not resume:
         if part is not None:
             raise TSDFError(f"{part_file} exists already: add --resume to go on with it, or choose another --out")
         raise TSDFError(f"{part_file} holds an unfinished build: add --resume to go on with it, or delete it")
 
+    from tsdf.format import write
     from tsdf.grains import load_grain
 
     shape = load_grain(grain, repair=repair, **settings)
@@ -247,49 +225,41 @@ def main(
             differing = ", ".join(key for key in build.request if build.request[key] != stored.request.get(key))
             raise TSDFError(f"{part_file} is of another build (they differ in {differing}): delete it to start anew")
         build = stored
-    try:
-        _run(build, shape, threads or os.cpu_count() or 1, part, part_file, quiet)
-        table = build.table() if part is None else None
-    except (GrainError, UsageError):
-        part_file.unlink(missing_ok=True)  # a refused build cannot be gone on with
-        raise
+
+    def interrupted() -> str:
+        safe = f"{build.paths} paths are safe in {plain(part_file)}; go on with --resume"
+        return safe if build.done and part_file.exists() else "nothing is done yet"
+
+    with interruptible(interrupted):
+        try:
+            with shown_progress(quiet) as progress:
+                build.run(
+                    shape, threads or os.cpu_count() or 1, part or (1, 1), part_file, told(progress, target_error)
+                )
+            table = build.table() if part is None else None
+        except (GrainError, UsageError):
+            part_file.unlink(missing_ok=True)  # a refused build cannot be gone on with
+            raise
+        if table is not None:
+            write(table, out)
     if part is not None:
         if not quiet:
             click.echo(f"{out}: part {part[0]} of {part[1]}, {build.paths} paths; tsdf-merge makes the table")
         return
-    finish(table, out, quiet)
     part_file.unlink(missing_ok=True)
-
-
-def _run(build: "Build", shape: Any, threads: int, part: tuple[int, int] | None, part_file: Path, quiet: bool) -> None:
-    """Trace with a progress bar; an interrupt says what is safe."""
-
-    def stop(number: int, _: object) -> None:
-        raise KeyboardInterrupt(number)
-
-    before = signal.signal(signal.SIGTERM, stop)
-    bar = Bar(build.effort.target_error, quiet)
-    try:
-        build.run(shape, threads, part or (1, 1), part_file, bar)
-    except KeyboardInterrupt as interrupt:
-        bar.close()
-        safe = (
-            f"{build.paths} paths are safe in {part_file}; go on with --resume"
-            if part_file.exists()
-            else "nothing done yet"
-        )
-        click.echo(f"interrupted: {safe}", err=True)
-        raise SystemExit(128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)) from None
-    finally:
-        bar.close()
-        signal.signal(signal.SIGTERM, before)
+    summary(table, out, quiet)
 
 
 def finish(table: Any, out: Path, quiet: bool) -> None:
-    """Write a finished table and sum it up on standard output."""
+    """Write a finished table and sum it up."""
     from tsdf.format import write
 
     write(table, out)
+    summary(table, out, quiet)
+
+
+def summary(table: Any, out: Path, quiet: bool) -> None:
+    """Sum a table up on standard output."""
     ledger = table.header["energy_ledger"]
     leak = (ledger["lost"] + ledger["truncated"]) / ledger["launched"]
     if leak > 1e-6:

@@ -1,21 +1,30 @@
-"""What every command shares: one-line errors, exit statuses, and text from files made safe to show.
+"""What every command shares: errors of one line, exit statuses, outputs that destroy nothing, progress, and options
+that mean the same everywhere.
 
 Results go to standard output, everything else to standard error. Exit status: 0 done, 1 the data or the machine
-failed, 2 the request cannot be meant, 130 interrupted. Nothing slow is imported here.
+failed, 2 the request cannot be meant, 130 interrupted, 143 by SIGTERM. Nothing slow is imported here.
 """
 
 import contextlib
 import os
-import signal
 import sys
+import threading
+import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 import click
 
+from tsdf.cli.start import answer, interrupt_status
 from tsdf.errors import TSDFError, UsageError
+
+LEVELS = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume", "volume-hg", "isotropic")
+EVERY_S = 60.0  # [s] between lines of progress where no terminal shows a bar
+LEAST_S = 0.1  # [s] between two looks of a bar
+TICK_S = 0.5  # [s] the clock of a bar goes on even if nothing is heard
+COMPILING = "compiling, once for this machine"
 
 
 def plain(value: Any) -> str:
@@ -31,13 +40,21 @@ class Tool(click.Command):
         self, args: Sequence[str] | None = None, prog_name: str | None = None, *rest: Any, **extra: Any
     ) -> NoReturn:
         """Run the command and exit."""
+        if args is None:  # a process of its own
+            answer(str(self.name))
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(AttributeError, ValueError):
                 stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
         with warnings.catch_warnings():
             warnings.simplefilter("default")
             warnings.showwarning = lambda message, *_: self._tell("warning", message)  # type: ignore[assignment]
-            sys.exit(self._status(args, **extra))
+            status = self._status(args, **extra)
+        try:
+            sys.stdout.flush()
+        except (OSError, ValueError):  # told already; or else Python would tell of it once more at exit
+            with contextlib.suppress(OSError, ValueError, AttributeError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(status)
 
     def _status(self, args: Sequence[str] | None, **extra: Any) -> int:
         try:
@@ -54,13 +71,11 @@ class Tool(click.Command):
         except TSDFError as error:
             return self._tell("error", error, 1)
         except (KeyboardInterrupt, click.Abort):
-            return self._tell("error", "interrupted", 130)
+            return self._tell("error", "interrupted", interrupt_status())
         except BrokenPipeError:
-            with contextlib.suppress(OSError, ValueError, AttributeError):
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
             return 1
         except OSError as error:
-            name = f"{plain(error.filename)}: " if error.filename else ""
+            name = f"{plain(error.filename)}: " if error.filename else "input or output: "
             return self._tell("error", f"{name}{error.strerror or error}", 1)
         except MemoryError:
             return self._tell("error", "not enough memory", 1)
@@ -76,37 +91,178 @@ class Tool(click.Command):
         return status
 
 
-def make_folder(out: Path) -> None:
-    """Make the folder that --out names, if it is not there.
+# --- outputs ------------------------------------------------------------------------
+
+
+def check_output(out: Path, *inputs: Path, beside: Iterable[Path] = ()) -> None:
+    """Refuse an output that cannot be written, or would replace an input, before any work is done for it.
+
+    Parameters
+    ----------
+    out : path
+        What --out names.
+    inputs : paths
+        All that is read. However they are spelled and linked, they are left alone.
+    beside : paths
+        What is written beside `out`.
 
     Raises
     ------
     TSDFError
     """
+    from tsdf import files
+
+    read = [source for path in inputs for source in files.sources(Path(path))]
+    written: list[Path] = []
+    for path in (out, *beside):
+        shown = plain(path)
+        if shown != os.fspath(path):
+            raise UsageError(f"cannot write {shown}: its name cannot be shown on one line; choose another --out")
+        if any(_same(path, other) for other in read):
+            raise UsageError(f"cannot write {shown}: it is an input; choose another --out")
+        if any(_same(path, other) for other in written):
+            raise UsageError(f"cannot write {shown}: another output is the same file; choose another --out")
+        written.append(path)
+        folder = Path(os.path.realpath(path)).parent
+        if not folder.is_dir():
+            raise TSDFError(f"cannot write {shown}: {plain(folder)} is not a folder; make it, or choose another --out")
+        try:
+            files.probe(path)
+        except OSError as error:
+            raise TSDFError(f"cannot write {shown}: {error.strerror or error}; choose another --out") from None
+
+
+def _same(one: Path, other: Path) -> bool:
+    """Return whether two paths lead to one file, which need not be there yet."""
+    try:
+        return os.path.samefile(one, other)
+    except (OSError, ValueError):
+        return os.path.realpath(one) == os.path.realpath(other)
+
+
+def check_folder(out: Path, names: Iterable[str], *inputs: Path) -> None:
+    """Make the folder that --out names, if it is not there, and see to it that files of these names can be written.
+
+    Raises
+    ------
+    TSDFError
+    """
+    if not plain(out) == os.fspath(out):
+        raise UsageError(f"cannot write {plain(out)}: its name cannot be shown on one line; choose another --out")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise TSDFError(f"--out {plain(out)}: cannot be made: {error.strerror}; give a folder") from None
+    first, *others = (out / name for name in names)
+    check_output(first, *inputs, beside=others)
+
+
+# --- progress -----------------------------------------------------------------------
+
+
+class Progress:
+    """How far a command is, on standard error: a bar on a terminal, whose clock always goes; else a line a minute."""
+
+    def __init__(self, quiet: bool = False) -> None:
+        self._quiet = quiet
+        self._share, self._word = 0.0, ""
+        self._begun = self._shown = time.monotonic()
+        self._bar = None
+        if not quiet and sys.stderr.isatty():
+            from tqdm import tqdm
+
+            form = "{percentage:3.0f}% |{bar}| {postfix} [{elapsed}<{remaining}]"
+            self._bar = tqdm(total=1.0, bar_format=form, dynamic_ncols=True)
+
+    def __call__(self, share: float, word: str) -> None:
+        """Take note of the share done, in [0, 1], and of a word about it."""
+        self._share, self._word = share, word
+        if time.monotonic() - self._shown >= LEAST_S:
+            self.show()
+
+    def show(self) -> None:
+        """Show it, if it is time to."""
+        if self._quiet:
+            return
+        compiled = sys.modules.get("tsdf.compiled")
+        word = COMPILING if getattr(compiled, "compiling", bool)() else self._word
+        now = time.monotonic()
+        if self._bar is not None:
+            self._shown, self._bar.n = now, min(self._share, 1.0)
+            self._bar.set_postfix_str(word)
+        elif now - self._shown >= EVERY_S:
+            self._shown = now
+            minutes, seconds = divmod(int(now - self._begun), 60)
+            click.echo(f"{100.0 * self._share:.0f} %, {word} [{minutes}:{seconds:02d}]", err=True)
+
+    def note(self, text: str) -> None:
+        """Write a line above the bar."""
+        if self._quiet:
+            return
+        if self._bar is not None:
+            self._bar.clear()
+        click.echo(f"note: {plain(text)}", err=True)
+
+    def close(self) -> None:
+        """Leave the bar as it is."""
+        if self._bar is not None:
+            self.show()
+            self._bar.close()
 
 
 @contextlib.contextmanager
-def watched(quiet: bool) -> Iterator[Callable[[float, str], None]]:
-    """Show a progress bar, to be told the share done and a word, and let SIGTERM interrupt as Ctrl-C does."""
-    from tqdm import tqdm
+def shown_progress(quiet: bool) -> Iterator[Progress]:
+    """Show progress while this runs, with a clock that goes on whatever else is busy."""
+    progress, done = Progress(quiet), threading.Event()
 
-    def stop(*_: object) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # signals come twice, and the second is no other
-        raise KeyboardInterrupt
+    def tick() -> None:
+        while not done.wait(TICK_S):
+            with contextlib.suppress(OSError, ValueError):
+                progress.show()
 
-    before = signal.signal(signal.SIGTERM, stop)
-    form = "{percentage:3.0f}% |{bar}| {postfix} [{elapsed}]"
+    ticking = threading.Thread(target=tick, daemon=True)
+    ticking.start()
     try:
-        with tqdm(total=1.0, disable=quiet or None, bar_format=form, dynamic_ncols=True) as bar:
-
-            def progress(share: float, word: str) -> None:
-                bar.set_postfix_str(word, refresh=False)
-                bar.update(share - bar.n)
-
-            yield progress
+        yield progress
     finally:
-        signal.signal(signal.SIGTERM, before)
+        done.set()
+        ticking.join()
+        progress.close()
+
+
+# --- options ------------------------------------------------------------------------
+
+
+def check_numbers(seed: int | None = None, **least_one: int | None) -> None:
+    """Refuse a seed or other whole numbers that are out of range; None is not given.
+
+    Raises
+    ------
+    UsageError
+    """
+    for name, value in least_one.items():
+        if value is not None and value < 1:
+            raise UsageError(f"--{name} is a whole number of at least 1, not {value}")
+    if least_one.get("threads") is not None and least_one["threads"] > 1024:  # type: ignore[operator]
+        raise UsageError(f"--threads is at most 1024, not {least_one['threads']}")
+    if seed is not None and not 0 <= seed < 2**63:
+        raise UsageError(f"--seed is a whole number from 0 to 2^63 - 1, not {seed}")
+
+
+def named_levels(text: str | None, default: Sequence[str]) -> list[str]:
+    """Return the levels of --levels A,B,..
+
+    Raises
+    ------
+    UsageError
+        With the level that was likely meant.
+    """
+    from difflib import get_close_matches
+
+    chosen = [name.strip() for name in text.split(",")] if text is not None else list(default)
+    for name in chosen:
+        if name not in LEVELS:
+            near = get_close_matches(name, LEVELS, 1)
+            hint = f"did you mean {near[0]}?" if near else f"levels are {', '.join(LEVELS)}"
+            raise UsageError(f"--levels: no level {name!r}; {hint}")
+    return chosen

@@ -1,12 +1,14 @@
 """``tsdf-compare``: a scene in, the error and the time of every level out."""
 
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from tsdf.cli.common import Tool, make_folder, plain, watched
-from tsdf.cli.render import LEVELS, save
+from tsdf.cli.common import LEVELS, Tool, check_folder, check_numbers, named_levels, plain, shown_progress
+from tsdf.cli.render import save
+from tsdf.cli.start import interrupt_status, interruptible
 
 if TYPE_CHECKING:
     from tsdf.render import Picture
@@ -42,36 +44,37 @@ def main(
     its own noise is known. A level that is impossible is skipped with a word. Ctrl-C keeps what is done. Exit status
     130 then, 1 if the scene cannot be rendered, 2 if the request cannot be meant.
     """
-    from difflib import get_close_matches
-
-    from tsdf.errors import UsageError
-
-    chosen = [name.strip() for name in levels.split(",")] if levels is not None else list(LEVELS)
-    for name in chosen:
-        if name not in LEVELS:
-            near = get_close_matches(name, LEVELS, 1)
-            hint = f"did you mean {near[0]}?" if near else f"levels are {', '.join(LEVELS)}"
-            raise UsageError(f"--levels: no level {name!r}; {hint}")
-    for option, value in (("--spp", spp), ("--width", width), ("--threads", threads)):
-        if value is not None and value < 1:
-            raise UsageError(f"{option} is a whole number of at least 1, not {value}")
-    if seed is not None and not 0 <= seed < 2**63:
-        raise UsageError(f"--seed is a whole number from 0 to 2^63 - 1, not {seed}")
+    chosen = named_levels(levels, LEVELS)
+    check_numbers(seed, spp=spp, width=width, threads=threads)
 
     from tsdf import compare, plots
     from tsdf.files import replacing
-    from tsdf.scene import load, resized
+    from tsdf.scene import files_of, load, resized
 
     read = resized(load(scene), width)
-    make_folder(out)
+    pictures = [f"{name}{suffix}" for name in (*LEVELS, "reference") for suffix in (".exr", ".png")]
+    check_folder(out, ["levels.md", "levels.csv", "levels.png", *pictures], scene, *files_of(read))
+    stop, begun = threading.Event(), False
+
+    def interrupted() -> str | None:
+        if not begun:
+            return "nothing is written"
+        stop.set()
+        return None
 
     def keep(name: str, world: "World", picture: "Picture", own: int) -> None:
         save(world, picture, own, out / f"{name}.exr")
 
-    with watched(quiet) as progress:
+    with shown_progress(quiet) as progress, interruptible(interrupted):
+
+        def told(share: float, word: str) -> None:
+            nonlocal begun
+            begun = begun or share > 0.0
+            progress(share, word)
+
         found = compare.compare(
             read, chosen, spp, seconds, reference_seconds, packings, read.render.seed if seed is None else seed,
-            threads, progress, keep,
+            threads, told, keep, stop,
         )  # fmt: skip
     for name, text in (("levels.md", compare.markdown(found)), ("levels.csv", compare.csv_text(found))):
         with replacing(out / name) as temporary:
@@ -85,4 +88,4 @@ def main(
     lost = sum(row.picture.truncated + row.picture.faults for row in found.rows)
     if lost:
         click.echo(f"warning: {lost} paths were given up", err=True)
-    return 130 if found.interrupted else 0
+    return interrupt_status() if found.interrupted else 0

@@ -1,10 +1,11 @@
 """``tsdf-export``: parameters of a table's medium for other renderers."""
 
 import math
+from pathlib import Path
 
 import click
 
-from tsdf.cli.common import Tool, plain
+from tsdf.cli.common import Tool, check_output, plain
 
 TARGETS = ("pbrt", "blender", "openpbr", "materialx", "arnold", "karma", "csv", "npz")
 
@@ -66,6 +67,8 @@ def main(
     products = _products(absorption or "0")
     if to == "npz" and out is None:
         raise UsageError("npz is no text: say with --out where to write it")
+    if out is not None:
+        check_output(Path(out), Path(file))
 
     from tsdf import format
     from tsdf.loaders import export

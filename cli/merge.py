@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
-from tsdf.cli.build import check_output, finish
-from tsdf.cli.common import Tool
+from tsdf.cli.build import finish
+from tsdf.cli.common import Tool, check_output
 
 
 @click.command("tsdf-merge", cls=Tool)
@@ -14,7 +14,7 @@ from tsdf.cli.common import Tool
 @click.option("--quiet", is_flag=True, help="No summary.")
 def main(parts: tuple[Path, ...], out: Path, quiet: bool) -> None:
     """Merge the PARTS that tsdf-build --chunk i/n wrote, in any order, into one table."""
+    check_output(out, *parts)
     from tsdf.scatterometer import merge
 
-    check_output(out, *parts)
     finish(merge(list(parts)).table(), out, quiet)

@@ -1,14 +1,13 @@
 """``tsdf-packing``: sphere packings in, a packing table out; or what a packing table says of itself."""
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from tsdf.cli.build import _count, check_output
-from tsdf.cli.common import Tool, plain
+from tsdf.cli.build import _count
+from tsdf.cli.common import Tool, check_output, plain, shown_progress
 from tsdf.errors import UsageError
 
 if TYPE_CHECKING:
@@ -78,13 +77,16 @@ def main(
         show(neighbours.shipped() if file is None else neighbours.read(file))
         return
     check_output(out)
-    from tqdm import tqdm
-
     chosen = fractions or neighbours.FRACTIONS
-    with tqdm(total=len(set(chosen)), unit=" fractions", disable=quiet, file=sys.stderr, dynamic_ncols=True) as bar:
-        table = neighbours.tabulate(
-            chosen, packings, spheres, lines, cells, records, seed, progress=lambda _: bar.update()
-        )
+    done = 0
+    with shown_progress(quiet) as progress:
+
+        def told(fraction: float) -> None:
+            nonlocal done
+            done += 1
+            progress(done / len(set(chosen)), f"packing fraction {fraction:g}")
+
+        table = neighbours.tabulate(chosen, packings, spheres, lines, cells, records, seed, progress=told)
     neighbours.write(table, out)
     if not quiet:
         show(table, str(out))

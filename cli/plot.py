@@ -1,8 +1,10 @@
 """``tsdf-plot``: a picture of a table."""
 
+from pathlib import Path
+
 import click
 
-from tsdf.cli.common import Tool
+from tsdf.cli.common import Tool, check_output
 
 
 @click.command("tsdf-plot", cls=Tool)
@@ -18,6 +20,7 @@ def main(file: str, out: str) -> None:
     from tsdf import plots
 
     plots.check_suffix(out)
+    check_output(Path(out), Path(file))
     from tsdf import format
 
     plots.save(plots.plot_table(format.read(file)), out)

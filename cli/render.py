@@ -1,20 +1,18 @@
 """``tsdf-render``: a scene in, a picture out."""
 
 import json
-import signal
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from tsdf.cli.common import Tool, plain
+from tsdf.cli.common import LEVELS, Tool, check_numbers, check_output, plain, shown_progress
+from tsdf.cli.start import interrupt_status, interruptible
 
 if TYPE_CHECKING:
     from tsdf.render import Picture
     from tsdf.world import World
-
-LEVELS = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume", "volume-hg", "isotropic")
 
 
 @click.command("tsdf-render", cls=Tool)
@@ -41,62 +39,57 @@ def main(
     """Render the picture of SCENE, a TOML file.
 
     The same scene, level, seed and number of samples give the same picture for any number of threads. Ctrl-C writes the
-    picture so far. Exit status 130 then, 1 if the scene cannot be rendered, 2 if the request cannot be meant.
+    picture so far; once more, after two seconds, ends at once. Exit status 130 then, 1 if the scene cannot be rendered,
+    2 if the request cannot be meant.
     """
     from tsdf.errors import UsageError
 
     if out.suffix.lower() != ".exr":
         raise UsageError(f"--out {plain(out)}: is to end in .exr")
-    if not out.absolute().parent.is_dir():
-        raise UsageError(f"--out {plain(out)}: its folder does not exist; make it first")
-    for name, value in (("--spp", spp), ("--width", width), ("--threads", threads)):
-        if value is not None and value < 1:
-            raise UsageError(f"{name} is a whole number of at least 1, not {value}")
+    check_numbers(seed, spp=spp, width=width, threads=threads)
     for name, limit in (("--seconds", seconds), ("--target-error", target_error)):
         if limit is not None and not 0.0 < limit < float("inf"):
             raise UsageError(f"{name} is a finite number above 0, not {limit:g}")
-    if seed is not None and not 0 <= seed < 2**63:
-        raise UsageError(f"--seed is a whole number from 0 to 2^63 - 1, not {seed}")
     if sum(stop is not None for stop in (spp, seconds, target_error)) > 1:
         raise UsageError("--spp, --seconds and --target-error each say when to stop: give one")
 
-    from tqdm import tqdm
-
     from tsdf import render, world
-    from tsdf.scene import load, resized
+    from tsdf.scene import files_of, load, resized
 
     read = resized(load(scene), width)
-    made = world.build(read, level or read.render.level)
-    if not quiet:
-        for note in made.notes:
-            click.echo(f"note: {plain(note)}", err=True)
+    check_output(out, scene, *files_of(read), beside=[out.with_suffix(".png")])
     if spp is None and seconds is None and target_error is None:
         spp = read.render.spp
     seed = read.render.seed if seed is None else seed
 
-    # A flag, for signals come twice (timeout sends them to the process and to its group) and the second is no other
-    stop = threading.Event()
-    signals = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda *_: stop.set()) for number in signals]
-    form = "{percentage:3.0f}% |{bar}| {postfix} [{elapsed}<{remaining}]"
-    try:
-        with tqdm(total=1.0, disable=quiet or None, bar_format=form, dynamic_ncols=True) as bar:
+    stop, begun = threading.Event(), False
 
-            def progress(share: float, word: str) -> None:
-                bar.set_postfix_str(word, refresh=False)
-                bar.update(share - bar.n)
+    def interrupted() -> str | None:
+        if not begun:
+            return "nothing is written"
+        stop.set()
+        return None
 
-            picture = render.render(made, spp, seconds, target_error, seed, threads, progress, stop)
+    with shown_progress(quiet) as progress, interruptible(interrupted):
+
+        def told(share: float, word: str) -> None:
+            nonlocal begun
+            begun = True
+            progress(share, word)
+
+        progress(0.0, "reading the scene")
+        made = world.build(read, level or read.render.level)
+        for note in made.notes:
+            progress.note(note)
+        progress(0.0, "starting")
+        picture = render.render(made, spp, seconds, target_error, seed, threads, told, stop)
         if not picture.samples.any():
             click.echo("interrupted before the first sample: nothing is written", err=True)
-            return 130
+            return interrupt_status()
         save(made, picture, seed, out)
-    finally:
-        for number, handler in zip(signals, before, strict=True):
-            signal.signal(number, handler)
     if not quiet or picture.interrupted:
         summary(made, picture, out)
-    return 130 if picture.interrupted else 0
+    return interrupt_status() if picture.interrupted else 0
 
 
 def save(world: "World", picture: "Picture", seed: int, out: Path) -> None:

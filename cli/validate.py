@@ -1,10 +1,11 @@
 """``tsdf-validate``: whether tables are right."""
 
 import json
+from pathlib import Path
 
 import click
 
-from tsdf.cli.common import Tool, plain
+from tsdf.cli.common import Tool, check_output, plain
 from tsdf.errors import UsageError
 
 
@@ -31,6 +32,7 @@ def main(files: tuple[str, ...], as_json: bool, structure: bool, plot: str | Non
         plots.check_suffix(plot)
         if len(files) != 1 or structure:
             raise UsageError("--plot draws one FILE, checked in full")
+        check_output(Path(plot), Path(files[0]))
     from tsdf.validate import validate
 
     reports, failed = [], False

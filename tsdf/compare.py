@@ -228,6 +228,7 @@ def compare(
     threads: int | None = None,
     progress: Callable[[float, str], None] | None = None,
     done: Callable[[str, World, Picture, int], None] | None = None,
+    stop: threading.Event | None = None,
 ) -> Comparison:
     """Render a scene at several levels and measure them against the mean of several packings of single grains.
 
@@ -250,6 +251,8 @@ def compare(
     done : callable, optional
         Called with each finished picture: its name, world, picture and seed. Names are those of levels, "reference" for
         the mean of packings; that of the reference's level is its first packing.
+    stop : Event, optional
+        Set by others to end early; the rows are then those done so far.
 
     Raises
     ------
@@ -277,7 +280,7 @@ def compare(
     level, world = _reference(scene, notes)
     better = REFERENCES[: REFERENCES.index(level)]  # impossible, and noted
     others = [name for name in LEVELS if name in levels and name not in (level, *better)]
-    stop = threading.Event()
+    stop = stop or threading.Event()
     begun, jobs = 0, packings + len(others)
 
     def shot(world: World, number: int, what: str, spp: int | None, seconds: float | None) -> Picture | None:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core import caching, cpu
+from numba.core import caching, cpu, event
 
 from tsdf.files import whole
 
@@ -90,6 +90,27 @@ def _fallback() -> Path | None:
         stacklevel=2,
     )
     return folder
+
+
+class _Compiling(event.Listener):
+    """How many kernels are being compiled."""
+
+    count = 0
+
+    def on_start(self, _: Any) -> None:
+        self.count += 1
+
+    def on_end(self, _: Any) -> None:
+        self.count -= 1
+
+
+_now = _Compiling()
+event.register("numba:compile", _now)
+
+
+def compiling() -> bool:
+    """Return whether a kernel is being compiled, which may take a minute."""
+    return _now.count > 0
 
 
 class _Stamped:

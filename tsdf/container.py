@@ -243,7 +243,6 @@ def _write_checked(header: dict[str, Any], pixels: np.ndarray, path: Path, form:
         form.attribute: json.dumps(header, allow_nan=False, sort_keys=True, separators=(",", ":")),
         f"{form.attribute}_sha256": "0" * 64,
     }
-    path.touch(exist_ok=False)
     OpenEXR.File(attributes, {"Y": pixels}).write(str(path))
     blank = path.read_bytes()
     try:

@@ -7,12 +7,14 @@ ends with the process, so that the next one to write NAME can tell what a killed
 import contextlib
 import glob
 import os
+import re
 import secrets
 import stat
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import unquote
 
 from tsdf.errors import TSDFError
 
@@ -23,6 +25,12 @@ except ImportError:  # a system without such locks leaves what killed processes 
 
 STALE_S = 60.0  # [s] younger temporary files are left alone: their lock may be about to be taken
 PROBE = bytes(65536)  # what a disk must have room for before any work is done
+MOST_TEXT = 1 << 26  # [bytes] of a mesh that are looked at for names of other files
+_NAMES = {
+    ".gltf": rb'"uri"\s*:\s*"([^"]{1,1024})"',
+    ".obj": rb"(?m)^\s*mtllib\s+([^\r\n]{1,1024})",
+    ".mtl": rb"(?m)^\s*(?:map_\w+|bump|disp|decal|refl|norm)\s[^\r\n]*?([^\s]{1,1024})\s*$",
+}
 MAX_NAME = 255  # [bytes] of the name of a file on common file systems
 
 whole = threading.RLock()  # held while files are written that nothing tidies up: take it before ending the process
@@ -71,6 +79,19 @@ def probe(path: str | os.PathLike[str]) -> None:
         and os.getuid() not in (0, folder.st_uid, target.stat().st_uid)
     ):
         raise PermissionError("it belongs to another user, in a folder where only owners replace files")
+
+
+def sources(path: Path) -> Iterator[Path]:
+    """Return a file and, of a mesh in parts, the others that it names: buffers, materials and images."""
+    yield path
+    pattern = _NAMES.get(path.suffix.lower())
+    if pattern is None:
+        return
+    with contextlib.suppress(OSError), open(path, "rb") as file:
+        for name in re.findall(pattern, file.read(MOST_TEXT)):
+            text = os.fsdecode(name.strip())
+            for spelling in {text, unquote(text)}:
+                yield from sources(path.parent / spelling)
 
 
 def discard() -> None:

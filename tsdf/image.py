@@ -96,7 +96,6 @@ def write_exr(
     header = attributes | {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
     try:
         with replacing(path) as temporary:
-            temporary.touch(exist_ok=False)
             OpenEXR.File(header, channels).write(str(temporary))
             _check_written(temporary, Image(pixels[""], pixels.get("variance."), attributes))
     except (RuntimeError, ValueError, TypeError) as error:  # OpenEXR raises the first

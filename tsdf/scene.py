@@ -10,8 +10,8 @@ import difflib
 import math
 import os
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from itertools import pairwise
 from numbers import Integral, Real
 from pathlib import Path
@@ -229,6 +229,22 @@ def parse(data: Mapping[str, Any], folder: str | os.PathLike[str] = ".", name: s
         In one line, with the table, the key and the way out.
     """
     return replace(_SCENE(data, "the scene", _Place(name, "", Path(folder))), name=name)
+
+
+def files_of(scene: Scene) -> tuple[Path, ...]:
+    """Return all files that a scene names: tables, meshes and environments."""
+
+    def named(value: Any) -> Iterator[Path]:
+        if isinstance(value, Path):
+            yield value
+        elif isinstance(value, tuple):
+            for item in value:
+                yield from named(item)
+        elif is_dataclass(value) and not isinstance(value, Table):
+            for field in fields(value):
+                yield from named(getattr(value, field.name))
+
+    return tuple(dict.fromkeys(named(scene)))
 
 
 def absorption_at(spec: Absorption, wavelengths_nm: ArrayLike, metres_per_unit: float | None = None) -> np.ndarray:

@@ -1,0 +1,141 @@
+"""The first thing every command does: see to its streams and its memory, and answer Ctrl-C and SIGTERM.
+
+Python's own handlers run between two instructions of the main thread, and compiling a kernel is one instruction of a
+minute. So a thread of its own is told of signals: it ends the process at once, with one line and status 130 or 143, as
+long as there is nothing to keep; else it says so to the command, which then ends by itself. Nothing is imported here
+that takes time, for until `answer` has run a signal finds Python as it is.
+"""
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from typing import IO
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+AGAIN_S = 2.0  # [s] `timeout` sends each signal twice; one that comes later than this is meant
+SAVING_S = 1.0  # [s] for a file that is being written
+
+_name = ""  # of the command; none before `answer`
+_first: int | None = None  # the signal that came first
+_meaning: Callable[[], str | None] = str  # see `interruptible`
+_raises = False
+
+
+def answer(name: str) -> None:
+    """Answer SIGINT and SIGTERM from here on, in the name of a command."""
+    global _name
+    if _name or threading.current_thread() is not threading.main_thread():
+        return
+    _name = name
+    _open_streams()
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    threading.Thread(target=_listen, args=(reading,), daemon=True).start()
+    signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+    for number in SIGNALS:
+        signal.signal(number, _handle)
+
+
+@contextlib.contextmanager
+def interruptible(meaning: Callable[[], str | None], raises: bool = False) -> Iterator[None]:
+    """Say what an interrupt means while this runs.
+
+    Parameters
+    ----------
+    meaning : callable
+        Called in another thread when a signal comes. It returns what to say as the process ends at once ("" for no
+        more than that it does), or None if there is something to keep: then the command is to end by itself.
+    raises : bool
+        Whether KeyboardInterrupt is then raised in the main thread, too.
+    """
+    global _meaning, _raises
+    before = _meaning, _raises
+    _meaning, _raises = meaning, raises
+    try:
+        yield
+    finally:
+        _meaning, _raises = before
+
+
+def interrupt_status() -> int:
+    """Return the exit status of an interrupted command: 128 and the number of the signal."""
+    return 128 + (_first or signal.SIGINT)
+
+
+def _handle(number: int, _: object) -> None:
+    """Run in the main thread, after the other thread has been told."""
+    global _raises
+    if _raises and _meaning() is None:
+        _raises = False
+        raise KeyboardInterrupt
+
+
+def _listen(reading: int) -> None:
+    global _first
+    since = 0.0
+    while data := os.read(reading, 1):
+        number = data[0]
+        if number not in SIGNALS:
+            continue
+        if _first is None:
+            _first, since = number, time.monotonic()
+            try:
+                said = _meaning()
+            except Exception:  # it was asked in the middle of something
+                said = ""
+            if said is not None:
+                _end(number, said)
+        elif time.monotonic() - since > AGAIN_S:
+            _end(number, "at once: what was not written yet is lost")
+
+
+def _end(number: int, said: str) -> None:
+    """End the process, leaving nothing half-written."""
+    files = sys.modules.get("tsdf.files")
+    if hasattr(files, "discard"):
+        files.whole.acquire(timeout=SAVING_S)  # type: ignore[union-attr]
+        files.discard()  # type: ignore[union-attr]
+    with contextlib.suppress(OSError):
+        import select
+
+        text = f"{_name}: error: interrupted{': ' * bool(said)}{said}\n"
+        line = ("\n" * os.isatty(2) + text).encode(errors="backslashreplace")  # after ^C and a bar
+        if select.select([], [2], [], SAVING_S)[1]:
+            os.write(2, line)
+    os._exit(128 + number)
+
+
+def _open_streams() -> None:
+    """Give a process that was started with closed standard streams some, lest its files take their numbers.
+
+    What is written to a closed standard output fails, as elsewhere; what is written to a closed standard error is gone.
+    """
+    for number, mode in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, mode)
+
+    def stream(number: int) -> IO[str]:
+        return open(number, "w", errors="backslashreplace", closefd=False)
+
+    sys.stdout = sys.stdout or stream(1)
+    sys.stderr = sys.stderr or stream(2)
+
+
+def _command(name: str) -> Callable[[], None]:
+    def run() -> None:
+        answer(f"tsdf-{name}")
+        import_module(f"tsdf.cli.{name}").main()
+
+    return run
+
+
+accuracy, build, compare, export, info, merge, packing, plot, render, validate = map(
+    _command, ("accuracy", "build", "compare", "export", "info", "merge", "packing", "plot", "render", "validate")
+)
