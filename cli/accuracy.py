@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from tsdf.cli.common import Tool, check_folder, check_numbers, named_levels, plain, shown_progress
+from tsdf.cli.common import Tool, check_folder, check_numbers, named_levels, plain, say, shown_progress
 from tsdf.cli.start import interrupt_status, interruptible
 
 MEASURED = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume")
@@ -83,7 +83,7 @@ def main(
     if found.rows:
         plots.save(plots.plot_accuracy(accuracy.facts(found), found.fraction, found.name), out / "accuracy.png")
     if not quiet:
-        click.echo(accuracy.markdown(found), nl=False)
+        say(accuracy.markdown(found).removesuffix("\n"))
     if found.interrupted:
         click.echo(f"interrupted: {plain(out)} holds what was done", err=True)
     return interrupt_status() if found.interrupted else 0

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tsdf.cli.common import Progress, Tool, check_output, plain, shown_progress
+from tsdf.cli.common import Progress, Tool, check_output, plain, say, shown_progress
 from tsdf.cli.start import interruptible
 from tsdf.errors import GrainError, TSDFError, UsageError
 
@@ -244,7 +244,7 @@ def main(
             write(table, out)
     if part is not None:
         if not quiet:
-            click.echo(f"{out}: part {part[0]} of {part[1]}, {build.paths} paths; tsdf-merge makes the table")
+            say(f"{out}: part {part[0]} of {part[1]}, {build.paths} paths; tsdf-merge makes the table")
         return
     part_file.unlink(missing_ok=True)
     summary(table, out, quiet)
@@ -268,7 +268,7 @@ def summary(table: Any, out: Path, quiet: bool) -> None:
         return
     s, errors = table.statistics, table.header["standard_errors"]
     error = table.header["table_error"]
-    click.echo(f"{out}: {table.header['grain']['name']}, eta {table.header['optics']['eta']:.6g}")
+    say(f"{out}: {table.header['grain']['name']}, eta {table.header['optics']['eta']:.6g}")
     for label, name in (
         ("hit probability beta", "hit_probability"),
         ("mean cosine g", "mean_cosine"),
@@ -278,9 +278,9 @@ def summary(table: Any, out: Path, quiet: bool) -> None:
         ("mean path length [R]", "mean_path_length"),
         ("forward atom", "atom_forward"),
     ):
-        click.echo(f"  {label:40s}{s[name]:.6f} +- {errors[name]:.1e}")
-    click.echo(
+        say(f"  {label:40s}{s[name]:.6f} +- {errors[name]:.1e}")
+    say(
         f"  {'total variation to the truth, about':40s}{error['total_variation']:.2g} "
         f"(noise {error['sampling_noise']:.2g}, cells {error['cell_width']:.2g})"
     )
-    click.echo(f"  {'light lost or cut off':40s}{leak:.1e}")
+    say(f"  {'light lost or cut off':40s}{leak:.1e}")

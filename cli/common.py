@@ -17,6 +17,7 @@ from typing import Any, NoReturn
 
 import click
 
+from tsdf.cli import start
 from tsdf.cli.start import answer, interrupt_status
 from tsdf.errors import TSDFError, UsageError
 
@@ -25,6 +26,12 @@ EVERY_S = 60.0  # [s] between lines of progress where no terminal shows a bar
 LEAST_S = 0.1  # [s] between two looks of a bar
 TICK_S = 0.5  # [s] the clock of a bar goes on even if nothing is heard
 COMPILING = "compiling, once for this machine"
+
+
+def say(text: str) -> None:
+    """Write a line about a result that is in a file to standard output, unless that was closed on purpose."""
+    if not start.silent:
+        click.echo(text)
 
 
 def plain(value: Any) -> str:
@@ -75,7 +82,7 @@ class Tool(click.Command):
         except BrokenPipeError:
             return 1
         except OSError as error:
-            name = f"{plain(error.filename)}: " if error.filename else "input or output: "
+            name = f"{plain(error.filename)}: " if error.filename else "cannot read or write: "
             return self._tell("error", f"{name}{error.strerror or error}", 1)
         except MemoryError:
             return self._tell("error", "not enough memory", 1)
@@ -171,8 +178,8 @@ class Progress:
         if not quiet and sys.stderr.isatty():
             from tqdm import tqdm
 
-            form = "{percentage:3.0f}% |{bar}| {postfix} [{elapsed}<{remaining}]"
-            self._bar = tqdm(total=1.0, bar_format=form, dynamic_ncols=True)
+            form = "{percentage:3.0f}% |{bar}| {desc} [{elapsed}<{remaining}]"
+            self._bar = tqdm(total=1.0, bar_format=form, ncols=80, nrows=24)
 
     def __call__(self, share: float, word: str) -> None:
         """Take note of the share done, in [0, 1], and of a word about it."""
@@ -189,7 +196,9 @@ class Progress:
         now = time.monotonic()
         if self._bar is not None:
             self._shown, self._bar.n = now, min(self._share, 1.0)
-            self._bar.set_postfix_str(word)
+            with contextlib.suppress(OSError):
+                self._bar.ncols = os.get_terminal_size(2).columns or 80  # some terminals say that they have none
+            self._bar.set_description_str(word)
         elif now - self._shown >= EVERY_S:
             self._shown = now
             minutes, seconds = divmod(int(now - self._begun), 60)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsdf.cli.common import LEVELS, Tool, check_folder, check_numbers, named_levels, plain, shown_progress
+from tsdf.cli.common import LEVELS, Tool, check_folder, check_numbers, named_levels, plain, say, shown_progress
 from tsdf.cli.render import save
 from tsdf.cli.start import interrupt_status, interruptible
 
@@ -82,7 +82,7 @@ def main(
     if found.pictures > 1:
         plots.save(plots.plot_levels(compare.facts(found), found.reference, found.scene.name), out / "levels.png")
     if not quiet:
-        click.echo(compare.markdown(found), nl=False)
+        say(compare.markdown(found).removesuffix("\n"))
     if found.interrupted:
         click.echo(f"interrupted: {plain(out)} holds {len(found.rows)} of the levels", err=True)
     lost = sum(row.picture.truncated + row.picture.faults for row in found.rows)

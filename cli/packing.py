@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tsdf.cli.build import _count
-from tsdf.cli.common import Tool, check_output, plain, shown_progress
+from tsdf.cli.common import Tool, check_output, plain, say, shown_progress
 from tsdf.errors import UsageError
 
 if TYPE_CHECKING:
@@ -74,7 +74,8 @@ def main(
     from tsdf import neighbours
 
     if out is None:
-        show(neighbours.shipped() if file is None else neighbours.read(file))
+        for line in _lines(neighbours.shipped() if file is None else neighbours.read(file)):
+            click.echo(plain(line))
         return
     check_output(out)
     chosen = fractions or neighbours.FRACTIONS
@@ -89,16 +90,12 @@ def main(
         table = neighbours.tabulate(chosen, packings, spheres, lines, cells, records, seed, progress=told)
     neighbours.write(table, out)
     if not quiet:
-        show(table, str(out))
+        for line in _lines(table, str(out)):
+            say(plain(line))
 
 
-def show(table: "PackingTable", name: str = "") -> None:
-    """Write what a table says of itself on standard output."""
-    for line in _lines(table, name):
-        click.echo(plain(line))
-
-
-def _lines(table: "PackingTable", name: str) -> Iterator[str]:
+def _lines(table: "PackingTable", name: str = "") -> Iterator[str]:
+    """What a table says of itself."""
     made = table.header["provenance"]
     yield f"{name + ': ' if name else ''}packing table, format {table.header['format_version']}"
     yield f"  {'cells, records':<16}{table.cells} cells of exit_b2, {table.records} records each"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsdf.cli.common import LEVELS, Tool, check_numbers, check_output, plain, shown_progress
+from tsdf.cli.common import LEVELS, Tool, check_numbers, check_output, plain, say, shown_progress
 from tsdf.cli.start import interrupt_status, interruptible
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def main(
     if sum(stop is not None for stop in (spp, seconds, target_error)) > 1:
         raise UsageError("--spp, --seconds and --target-error each say when to stop: give one")
 
-    from tsdf import render, world
+    from tsdf import image, render, world
     from tsdf.scene import files_of, load, resized
 
     read = resized(load(scene), width)
@@ -81,6 +81,7 @@ def main(
         made = world.build(read, level or read.render.level)
         for note in made.notes:
             progress.note(note)
+        image.prepare()
         progress(0.0, "starting")
         picture = render.render(made, spp, seconds, target_error, seed, threads, told, stop)
         if not picture.samples.any():
@@ -115,7 +116,7 @@ def summary(world: "World", picture: "Picture", out: Path) -> None:
     low, high = int(picture.samples.min()), int(picture.samples.max())
     held = f"{low}" if low == high else f"{low} to {high}"
     state = "interrupted: holds" if picture.interrupted else "holds"
-    click.echo(
+    say(
         f"{plain(out)}: {state} {held} samples per pixel, level {world.level}, relative error "
         f"{picture.relative_error:.2g}, {picture.seconds:.1f} s, {picture.events / max(picture.seconds, 1e-9):.3g} "
         "grain events per second"

@@ -20,6 +20,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 AGAIN_S = 2.0  # [s] `timeout` sends each signal twice; one that comes later than this is meant
 SAVING_S = 1.0  # [s] for a file that is being written
 
+silent = False  # standard output was closed when the process began
 _name = ""  # of the command; none before `answer`
 _first: int | None = None  # the signal that came first
 _meaning: Callable[[], str | None] = str  # see `interruptible`
@@ -115,6 +116,7 @@ def _open_streams() -> None:
 
     What is written to a closed standard output fails, as elsewhere; what is written to a closed standard error is gone.
     """
+    global silent
     for number, mode in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
         try:
             os.fstat(number)
@@ -124,6 +126,7 @@ def _open_streams() -> None:
     def stream(number: int) -> IO[str]:
         return open(number, "w", errors="backslashreplace", closefd=False)
 
+    silent = sys.stdout is None
     sys.stdout = sys.stdout or stream(1)
     sys.stderr = sys.stderr or stream(2)
 

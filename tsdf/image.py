@@ -238,6 +238,11 @@ def spectral_weights(wavelengths: tuple[float, ...] | None = None) -> Spectrum:
     return Spectrum(nodes, weight)
 
 
+def prepare() -> None:
+    """Import what `write_png` needs, which takes a second or more, so that it then writes at once."""
+    _colour()
+
+
 def _colour() -> Any:
     """Return colour-science, which on import warns of what is not there and changes how numpy prints numbers."""
     printed = np.get_printoptions()
