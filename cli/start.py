@@ -19,6 +19,11 @@ from typing import IO
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 AGAIN_S = 2.0  # [s] `timeout` sends each signal twice; one that comes later than this is meant
 SAVING_S = 1.0  # [s] for a file that is being written
+# Address space that libraries take whatever is computed, from trials: half of it where nothing is compiled.
+LEAST_BYTES = 1280 << 20
+BYTES_PER_PROCESSOR = 160 << 20  # for the stack and the heap of each thread
+MOST_PROCESSORS = 64  # that numerical libraries start threads for
+COMPILING = ("tsdf-accuracy", "tsdf-build", "tsdf-compare", "tsdf-packing", "tsdf-render")
 
 silent = False  # standard output was closed when the process began
 _name = ""  # of the command; none before `answer`
@@ -34,6 +39,7 @@ def answer(name: str) -> None:
         return
     _name = name
     _open_streams()
+    _check_memory()
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     threading.Thread(target=_listen, args=(reading,), daemon=True).start()
@@ -131,10 +137,35 @@ def _open_streams() -> None:
     sys.stderr = sys.stderr or stream(2)
 
 
+def _check_memory() -> None:
+    """End here where the libraries would find too little memory: some of them then hang or crash.
+
+    Only a limit of the address space (ulimit -v) is known beforehand.
+    """
+    with contextlib.suppress(ImportError):  # a system without such limits
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        least = LEAST_BYTES + BYTES_PER_PROCESSOR * min(os.cpu_count() or 1, MOST_PROCESSORS)
+        least = least if _name in COMPILING else least // 2
+        if limit != resource.RLIM_INFINITY and limit < least:
+            said = f"not enough memory: ulimit -v is {limit >> 20} MiB, at least {least >> 20} are needed here"
+            with contextlib.suppress(OSError):
+                os.write(2, f"{_name}: error: {said}\n".encode())
+            os._exit(1)
+
+
 def _command(name: str) -> Callable[[], None]:
+    """Return the entry point of a command, which ends the process."""
+
     def run() -> None:
         answer(f"tsdf-{name}")
-        import_module(f"tsdf.cli.{name}").main()
+        try:
+            import_module(f"tsdf.cli.{name}").main()
+        except SystemExit as end:  # all is written: Python would give the handlers up before it ends
+            with contextlib.suppress(OSError, ValueError):
+                sys.stderr.flush()
+            os._exit(end.code if isinstance(end.code, int) else 1)
 
     return run
 
