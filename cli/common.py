@@ -172,7 +172,7 @@ class Progress:
 
     def __init__(self, quiet: bool = False) -> None:
         self._quiet = quiet
-        self._share, self._word = 0.0, ""
+        self._share, self._word = 0.0, "starting"
         self._begun = self._shown = time.monotonic()
         self._bar = None
         if not quiet and sys.stderr.isatty():
