@@ -72,6 +72,22 @@ def test_long_names(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_what_meshes_name(tmp_path: Path) -> None:
+    """All files of a mesh in parts, in circles too, and nothing is opened that could block."""
+    (tmp_path / "a.obj").write_text("\n" * 1000 + "\tmtllib  my own.mtl \r\nv 0 0 0\n")
+    (tmp_path / "my own.mtl").write_text("map_Kd -s 1 1 1 skin.png\nbump my own.mtl\nKd 1 1 1")
+    found = {path.name for path in files.sources(tmp_path / "a.obj")}
+    assert {"a.obj", "my own.mtl", "skin.png"} <= found
+    (tmp_path / "b.gltf").write_text('{"buffers": [{"uri":\n"in\\/the%20box.bin"}, {"uri": "data:;base64,AA"}]}')
+    assert tmp_path / "in" / "the box.bin" in files.sources(tmp_path / "b.gltf")
+    os.mkfifo(tmp_path / "c.obj")
+    assert files.sources(tmp_path / "c.obj") == [tmp_path / "c.obj"]
+    (tmp_path / "d.mtl").write_bytes(b"\n" * (1 << 20) + b" " * (1 << 20) + b"map_Kd " + b"a b " * (1 << 18))
+    begun = time.process_time()
+    files.sources(tmp_path / "d.mtl")
+    assert time.process_time() - begun < 2.0
+
+
 def test_only_regular_files(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo")
     for path in (tmp_path, tmp_path / "fifo", Path("/dev/full"), tmp_path / "none" / "a"):

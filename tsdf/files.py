@@ -26,10 +26,10 @@ except ImportError:  # a system without such locks leaves what killed processes 
 STALE_S = 60.0  # [s] younger temporary files are left alone: their lock may be about to be taken
 PROBE = bytes(65536)  # what a disk must have room for before any work is done
 MOST_TEXT = 1 << 26  # [bytes] of a mesh that are looked at for names of other files
-_NAMES = {
+_NAMES = {  # how they name them; of a line of materials the last word is one
     ".gltf": rb'"uri"\s*:\s*"([^"]{1,1024})"',
-    ".obj": rb"(?m)^\s*mtllib\s+([^\r\n]{1,1024})",
-    ".mtl": rb"(?m)^\s*(?:map_\w+|bump|disp|decal|refl|norm)\s[^\r\n]*?([^\s]{1,1024})\s*$",
+    ".obj": rb"(?m)^[ \t]*mtllib[ \t]+([^\r\n]{1,1024})",
+    ".mtl": rb"(?m)^[ \t]*(?:map_\w{1,16}|bump|disp|decal|refl|norm)[ \t]([^\r\n]{1,1024})",
 }
 MAX_NAME = 255  # [bytes] of the name of a file on common file systems
 
@@ -81,17 +81,24 @@ def probe(path: str | os.PathLike[str]) -> None:
         raise PermissionError("it belongs to another user, in a folder where only owners replace files")
 
 
-def sources(path: Path) -> Iterator[Path]:
+def sources(path: Path) -> list[Path]:
     """Return a file and, of a mesh in parts, the others that it names: buffers, materials and images."""
-    yield path
-    pattern = _NAMES.get(path.suffix.lower())
-    if pattern is None:
-        return
-    with contextlib.suppress(OSError), open(path, "rb") as file:
-        for name in re.findall(pattern, file.read(MOST_TEXT)):
-            text = os.fsdecode(name.strip())
-            for spelling in {text, unquote(text)}:
-                yield from sources(path.parent / spelling)
+    found: dict[Path, None] = {}
+    waiting = [path]
+    while waiting:
+        one = waiting.pop()
+        pattern = _NAMES.get(one.suffix.lower())
+        if one in found:
+            continue
+        found[one] = None
+        if pattern is None or not one.is_file():
+            continue
+        with contextlib.suppress(OSError), open(one, "rb") as file:
+            for name in map(os.fsdecode, re.findall(pattern, file.read(MOST_TEXT))):
+                plainly = name.strip().replace("\\/", "/")
+                spellings = {plainly, unquote(plainly), plainly.split()[-1] if plainly else ""} - {""}
+                waiting += [one.parent / spelling for spelling in spellings if "\0" not in spelling]
+    return list(found)
 
 
 def discard() -> None:
