@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tsdf.cli.common import Progress, Tool, check_output, plain, say, shown_progress
+from tsdf.cli.common import Progress, Tool, check_numbers, check_output, plain, say, shown_progress
 from tsdf.cli.start import interruptible
 from tsdf.errors import GrainError, TSDFError, UsageError
 
@@ -175,8 +175,7 @@ def main(
         raise UsageError("give --eta or --material, not both")
     if eta is not None and wavelength_nm is not None:
         raise UsageError("--wavelength-nm goes with --material, not with --eta")
-    if threads is not None and not (1 <= threads <= 1024):
-        raise UsageError(f"the threads must be 1 to 1024, got {threads}")
+    check_numbers(threads=threads)
     if traced and grain != "sphere":
         raise UsageError("--traced is for the exact sphere; every other grain is traced anyway")
     exact = grain == "sphere" and not traced

@@ -22,6 +22,7 @@ from tsdf.cli.start import answer, interrupt_status
 from tsdf.errors import TSDFError, UsageError
 
 LEVELS = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume", "volume-hg", "isotropic")
+MOST_THREADS = 1024
 EVERY_S = 60.0  # [s] between lines of progress where no terminal shows a bar
 LEAST_S = 0.1  # [s] between two looks of a bar
 TICK_S = 0.5  # [s] the clock of a bar goes on even if nothing is heard
@@ -188,9 +189,12 @@ class Progress:
             self.show()
 
     def show(self) -> None:
-        """Show it, if it is time to."""
-        if self._quiet:
-            return
+        """Show it, if it is time to; a reader who is gone costs no result."""
+        if not self._quiet:
+            with contextlib.suppress(OSError, ValueError):
+                self._show()
+
+    def _show(self) -> None:
         compiled = sys.modules.get("tsdf.compiled")
         word = COMPILING if getattr(compiled, "compiling", bool)() else self._word
         now = time.monotonic()
@@ -208,9 +212,10 @@ class Progress:
         """Write a line above the bar."""
         if self._quiet:
             return
-        if self._bar is not None:
-            self._bar.clear()
-        click.echo(f"note: {plain(text)}", err=True)
+        with contextlib.suppress(OSError, ValueError):
+            if self._bar is not None:
+                self._bar.clear()
+            click.echo(f"note: {plain(text)}", err=True)
 
     def close(self) -> None:
         """Leave the bar as it is."""
@@ -226,8 +231,7 @@ def shown_progress(quiet: bool) -> Iterator[Progress]:
 
     def tick() -> None:
         while not done.wait(TICK_S):
-            with contextlib.suppress(OSError, ValueError):
-                progress.show()
+            progress.show()
 
     ticking = threading.Thread(target=tick, daemon=True)
     ticking.start()
@@ -242,20 +246,20 @@ def shown_progress(quiet: bool) -> Iterator[Progress]:
 # --- options ------------------------------------------------------------------------
 
 
-def check_numbers(seed: int | None = None, **least_one: int | None) -> None:
-    """Refuse a seed or other whole numbers that are out of range; None is not given.
+def check_numbers(seed: int | None = None, threads: int | None = None, **counts: int | None) -> None:
+    """Refuse whole numbers that are out of range; None is not given.
 
     Raises
     ------
     UsageError
     """
-    for name, value in least_one.items():
-        if value is not None and value < 1:
-            raise UsageError(f"--{name} is a whole number of at least 1, not {value}")
-    if least_one.get("threads") is not None and least_one["threads"] > 1024:  # type: ignore[operator]
-        raise UsageError(f"--threads is at most 1024, not {least_one['threads']}")
     if seed is not None and not 0 <= seed < 2**63:
         raise UsageError(f"--seed is a whole number from 0 to 2^63 - 1, not {seed}")
+    if threads is not None and not 1 <= threads <= MOST_THREADS:
+        raise UsageError(f"--threads is a whole number from 1 to {MOST_THREADS}, not {threads}")
+    for name, value in counts.items():
+        if value is not None and value < 1:
+            raise UsageError(f"--{name} is a whole number of at least 1, not {value}")
 
 
 def named_levels(text: str | None, default: Sequence[str]) -> list[str]:

@@ -232,5 +232,20 @@ def test_progress(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
     assert capsys.readouterr().err == ""
 
 
+def test_a_reader_who_is_gone_costs_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Standard error is a pipe that nobody reads any more."""
+
+    def gone(*_: object, **__: object) -> None:
+        raise BrokenPipeError
+
+    for name in ("EVERY_S", "LEAST_S"):
+        monkeypatch.setattr(common, name, 0.0)
+    progress = common.Progress()
+    with monkeypatch.context() as patch:
+        patch.setattr(common.click, "echo", gone)
+        progress(0.5, "word")
+        progress.note("note")
+
+
 def test_levels_are_those_of_scenes() -> None:
     assert common.LEVELS == scene.LEVELS
