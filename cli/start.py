@@ -19,11 +19,11 @@ from typing import IO
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 AGAIN_S = 2.0  # [s] `timeout` sends each signal twice; one that comes later than this is meant
 SAVING_S = 1.0  # [s] for a file that is being written
-# Address space that libraries take whatever is computed, from trials: half of it where nothing is compiled.
+# Address space that libraries take whatever is computed, from trials: half of it for commands that only read tables.
 LEAST_BYTES = 1280 << 20
 BYTES_PER_PROCESSOR = 160 << 20  # for the stack and the heap of each thread
 MOST_PROCESSORS = 64  # that numerical libraries start threads for
-COMPILING = ("tsdf-accuracy", "tsdf-build", "tsdf-compare", "tsdf-packing", "tsdf-render")
+HEAVY = ("tsdf-accuracy", "tsdf-build", "tsdf-compare", "tsdf-packing", "tsdf-render")
 
 silent = False  # standard output was closed when the process began
 _name = ""  # of the command; none before `answer`
@@ -147,7 +147,7 @@ def _check_memory() -> None:
 
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         least = LEAST_BYTES + BYTES_PER_PROCESSOR * min(os.cpu_count() or 1, MOST_PROCESSORS)
-        least = least if _name in COMPILING else least // 2
+        least = least if _name in HEAVY else least // 2
         if limit != resource.RLIM_INFINITY and limit < least:
             said = f"not enough memory: ulimit -v is {limit >> 20} MiB, at least {least >> 20} are needed here"
             with contextlib.suppress(OSError):

@@ -38,7 +38,8 @@ def test_whole_or_not_at_all(tmp_path: Path) -> None:
 
 def test_what_killed_processes_leave(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A dead writer's file goes at the next write to the same name; a living one's, another name's and others' stay."""
-    path, others = tmp_path / "a[1]*.exr", [tmp_path / ".a.tmp", tmp_path / ".a.exr.0123456789abcdef.tmp"]
+    path = tmp_path / "a[1]*.exr"
+    others = [tmp_path / f".{name}.tmp" for name in ("a", "a.exr.0123456789abcdef", "a[1]*.exr", "a[1]*.exr.backup")]
     for other in others:
         other.write_text("mine")
     dead, alive = (

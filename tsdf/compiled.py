@@ -118,8 +118,9 @@ class _Stamped:
 
     _py_file: str
 
-    def get_source_stamp(self) -> str:
-        return stamp(Path(self._py_file).stem)
+    def get_source_stamp(self) -> Any:
+        path = Path(self._py_file)
+        return stamp(path.stem) if path.parent == PACKAGE else super().get_source_stamp()  # type: ignore[misc]
 
 
 class _Given(_Stamped, caching.UserProvidedCacheLocator):

@@ -113,11 +113,13 @@ def sweep(target: Path) -> None:
     if flock is None:
         return
     with contextlib.suppress(OSError):
-        for path in list(target.parent.glob(f"{glob.escape(_stem(target))}.*.tmp")):
+        for path in list(target.parent.glob(glob.escape(_stem(target)) + "." + "[0-9a-f]" * 16 + ".tmp")):
+            found = path.lstat()
+            if not stat.S_ISREG(found.st_mode) or time.time() - found.st_mtime < STALE_S:
+                continue
             with contextlib.suppress(OSError), open(path, "rb") as file:
-                if time.time() - os.fstat(file.fileno()).st_mtime > STALE_S:
-                    flock(file, LOCK_EX | LOCK_NB)  # refused while its writer lives
-                    path.unlink()
+                flock(file, LOCK_EX | LOCK_NB)  # refused while its writer lives
+                path.unlink()
 
 
 def _target(path: str | os.PathLike[str]) -> Path:
