@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from tsdf.cli.common import Tool, check_folder, check_numbers, named_levels, plain, say, shown_progress
-from tsdf.cli.start import interrupt_status, interruptible
+from tsdf.cli.start import interrupt_status, interrupted, interruptible
 
 MEASURED = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume")
 
@@ -60,28 +60,32 @@ def main(
     meshes = [] if mesh is None else [mesh]
     check_folder(out, ["accuracy.md", "accuracy.csv", "accuracy.png"], table, *meshes)
     begun = False
-    try:
-        with (
-            shown_progress(quiet) as progress,
-            interruptible(lambda: None if begun else "nothing is written", raises=True),
-        ):
 
-            def told(share: float, word: str) -> None:
-                nonlocal begun
-                begun = begun or share > 0.0
-                progress(share, word)
+    def meaning() -> str | None:
+        return None if begun else "nothing is written"
 
-            found = accuracy.measure(
-                GrainSpec(read, mesh=mesh), packing, layer, chosen, packings, seconds, paths, seed, threads, told,
-                plain(table.name),
-            )  # fmt: skip
-    except SceneError as error:
-        raise TSDFError(f"{error} (--mesh FILE)" if mesh is None else str(error)) from None
-    for name, text in (("accuracy.md", accuracy.markdown(found)), ("accuracy.csv", accuracy.csv_text(found))):
-        with replacing(out / name) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    if found.rows:
-        plots.save(plots.plot_accuracy(accuracy.facts(found), found.fraction, found.name), out / "accuracy.png")
+    with shown_progress(quiet) as progress, interruptible(meaning):
+
+        def told(share: float, word: str) -> None:
+            nonlocal begun
+            if interrupted():  # the exception was lost on its way, in a callback say
+                raise KeyboardInterrupt
+            begun = begun or share > 0.0
+            progress(share, word)
+
+        try:
+            with interruptible(meaning, raises=True):
+                found = accuracy.measure(
+                    GrainSpec(read, mesh=mesh), packing, layer, chosen, packings, seconds, paths, seed, threads, told,
+                    plain(table.name),
+                )  # fmt: skip
+        except SceneError as error:
+            raise TSDFError(f"{error} (--mesh FILE)" if mesh is None else str(error)) from None
+        for name, text in (("accuracy.md", accuracy.markdown(found)), ("accuracy.csv", accuracy.csv_text(found))):
+            with replacing(out / name) as temporary:
+                temporary.write_text(text, encoding="utf-8")
+        if found.rows:
+            plots.save(plots.plot_accuracy(accuracy.facts(found), found.fraction, found.name), out / "accuracy.png")
     if not quiet:
         say(accuracy.markdown(found).removesuffix("\n"))
     if found.interrupted:

@@ -76,11 +76,11 @@ def main(
             read, chosen, spp, seconds, reference_seconds, packings, read.render.seed if seed is None else seed,
             threads, told, keep, stop,
         )  # fmt: skip
-    for name, text in (("levels.md", compare.markdown(found)), ("levels.csv", compare.csv_text(found))):
-        with replacing(out / name) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    if found.pictures > 1:
-        plots.save(plots.plot_levels(compare.facts(found), found.reference, found.scene.name), out / "levels.png")
+        for name, text in (("levels.md", compare.markdown(found)), ("levels.csv", compare.csv_text(found))):
+            with replacing(out / name) as temporary:
+                temporary.write_text(text, encoding="utf-8")
+        if found.pictures > 1:
+            plots.save(plots.plot_levels(compare.facts(found), found.reference, found.scene.name), out / "levels.png")
     if not quiet:
         say(compare.markdown(found).removesuffix("\n"))
     if found.interrupted:

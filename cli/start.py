@@ -69,6 +69,11 @@ def interruptible(meaning: Callable[[], str | None], raises: bool = False) -> It
         _meaning, _raises = before
 
 
+def interrupted() -> bool:
+    """Return whether a signal has come."""
+    return _first is not None
+
+
 def interrupt_status() -> int:
     """Return the exit status of an interrupted command: 128 and the number of the signal."""
     return 128 + (_first or signal.SIGINT)

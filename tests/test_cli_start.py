@@ -36,11 +36,13 @@ start.AGAIN_S = {again}
 start.answer("tsdf-busy")
 with replacing("half.txt") as temporary, start.interruptible({meaning}):
     temporary.write_text("half")
-    print("busy", flush=True)
     {wait}
 """
-WAIT = "hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)"  # one instruction of minutes, as compiling is
+WAIT = """print("busy", flush=True)
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)  # one instruction of minutes, as compiling is
+"""
 RAISED = """try:
+        print("busy", flush=True)
         __import__("time").sleep(60)
     except KeyboardInterrupt:
         print("kept", start.interrupt_status())
