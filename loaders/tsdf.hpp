@@ -132,10 +132,12 @@ struct Table {
         return statistics.albedo * out / all;
     }
 
-    // Mean cosine of what is let out, for absorption = sigma_a R; NaN if it is negative or nothing is let out.
+    // Mean cosine in [-1, 1] of what is let out, for absorption = sigma_a R; NaN if that is negative or nothing is.
     double mean_cosine(double absorption = 0.0) const noexcept {
         if (!(absorption >= 0.0)) return std::numeric_limits<double>::quiet_NaN();
-        if (absorption == 0.0) return statistics.mean_cosine;
+        const auto inside = [](double g) { return (std::min)((std::max)(g, -1.0), 1.0); };
+        const double given = inside(statistics.mean_cosine);
+        if (absorption == 0.0) return given;
         double all = 0.0, lossless = 0.0, out = 0.0, absorbing = 0.0;
         for (std::size_t c = 0; c < columns; ++c) {
             const double p = double(row(p_theta.first_row)[c]), q = p * survival(c, absorption);
@@ -146,7 +148,7 @@ struct Table {
             absorbing += q * middle;
         }
         if (!(out > 0.0)) return std::numeric_limits<double>::quiet_NaN();
-        return statistics.mean_cosine + absorbing / out - lossless / all;
+        return inside(given + absorbing / out - lossless / all);
     }
 
     // Free path among grains of bounding radius R > 0 whose bounding spheres fill a share f in (0, 0.74] of space;
@@ -455,19 +457,22 @@ class Inflate {
 
 // ---------------------------------------------------------------------------------------------------- header
 
-// Parses JSON (RFC 8259) in ASCII without faith in its author.
+// Parses JSON (RFC 8259) in ASCII without faith in its author: its depth, then its syntax, then its keys and numbers.
 class Json {
   public:
     Json(const char* data, std::size_t count) noexcept : text(data), size(count) {}
 
     bool parse(Value& value) {
+        if (!shallow()) return false;
         for (std::size_t i = 0; i < size; ++i)
             if (static_cast<unsigned char>(text[i]) > 127) return fail("HEADER_JSON", "not ASCII", i);
         blanks();
-        if (!any(value, 0)) return false;
+        if (!any(value)) return false;
         blanks();
         if (at != size) return fail("HEADER_JSON", "something follows the object", at);
         if (value.type != Value::Type::object) return fail("HEADER_JSON", "the header is not a JSON object", 0);
+        if (twice < size) return fail("HEADER_DUPLICATE_KEY", "an object has a key twice", twice);
+        if (beyond < size) return fail("HEADER_NUMBER", "a number does not fit 64 bits", beyond);
         return true;
     }
 
@@ -475,6 +480,24 @@ class Json {
     std::size_t place = 0;
 
   private:
+    // Whether no more than 32 brackets are open at once outside strings, whatever else is wrong with the text.
+    bool shallow() noexcept {
+        long long open = 0;
+        bool quoted = false;
+        for (std::size_t i = 0; i < size; ++i) {
+            const char c = text[i];
+            if (quoted && c == '\\')
+                ++i;
+            else if (c == '"')
+                quoted = !quoted;
+            else if (!quoted && (c == '[' || c == '{') && ++open > 32)
+                return fail("HEADER_DEPTH", "nested deeper than 32", i);
+            else if (!quoted && (c == ']' || c == '}'))
+                --open;
+        }
+        return true;
+    }
+
     bool fail(const char* rule, const char* what, std::size_t where) noexcept {
         code = rule;
         message = what;
@@ -497,10 +520,10 @@ class Json {
         return true;
     }
 
-    bool any(Value& value, int depth) {
+    bool any(Value& value) {
         switch (peek()) {
-            case '{': return object(value, depth + 1);
-            case '[': return array(value, depth + 1);
+            case '{': return object(value);
+            case '[': return array(value);
             case '"': value.type = Value::Type::text; return string(value.text);
             case 't': value.type = Value::Type::boolean; value.truth = true; return literal("true");
             case 'f': value.type = Value::Type::boolean; return literal("false");
@@ -509,15 +532,14 @@ class Json {
         }
     }
 
-    bool array(Value& value, int depth) {
-        if (depth > 32) return fail("HEADER_DEPTH", "nested deeper than 32", at);
+    bool array(Value& value) {
         value.type = Value::Type::array;
         ++at;
         blanks();
         if (peek() == ']') return ++at, true;
         for (;;) {
             value.items.emplace_back();
-            if (!any(value.items.back(), depth)) return false;
+            if (!any(value.items.back())) return false;
             blanks();
             if (peek() == ']') return ++at, true;
             if (peek() != ',') return syntax();
@@ -526,8 +548,7 @@ class Json {
         }
     }
 
-    bool object(Value& value, int depth) {
-        if (depth > 32) return fail("HEADER_DEPTH", "nested deeper than 32", at);
+    bool object(Value& value) {
         value.type = Value::Type::object;
         const std::size_t begin = at++;
         blanks();
@@ -541,7 +562,7 @@ class Json {
             ++at;
             blanks();
             value.items.emplace_back();
-            if (!any(value.items.back(), depth)) return false;
+            if (!any(value.items.back())) return false;
             blanks();
             if (peek() == '}') break;
             if (peek() != ',') return syntax();
@@ -554,7 +575,7 @@ class Json {
         const auto less = [](const std::string* a, const std::string* b) { return *a < *b; };
         std::sort(sorted.begin(), sorted.end(), less);
         for (std::size_t i = 1; i < sorted.size(); ++i)
-            if (*sorted[i - 1] == *sorted[i]) return fail("HEADER_DUPLICATE_KEY", "an object has a key twice", begin);
+            if (*sorted[i - 1] == *sorted[i]) twice = (std::min)(twice, begin);
         return true;
     }
 
@@ -646,23 +667,29 @@ class Json {
         if (value.whole) {
             const bool negative = plain[0] == '-';
             std::uint64_t magnitude = 0;
-            if (plain.size() > 20) return fail("HEADER_NUMBER", "an integer does not fit 64 bits", begin);
+            if (plain.size() > 20) return unfit(begin);
             for (std::size_t i = negative ? 1 : 0; i < plain.size(); ++i) {
-                if (magnitude > (std::uint64_t(1) << 63) / 10) return fail("HEADER_NUMBER", "too large", begin);
+                if (magnitude > (std::uint64_t(1) << 63) / 10) return unfit(begin);
                 magnitude = magnitude * 10 + std::uint64_t(plain[i] - '0');
             }
-            if (magnitude >= std::uint64_t(1) << 63)
-                return fail("HEADER_NUMBER", "an integer does not fit 64 bits", begin);
+            if (magnitude >= std::uint64_t(1) << 63) return unfit(begin);
             value.integer = negative ? -std::int64_t(magnitude) : std::int64_t(magnitude);
             value.number = double(value.integer);
             return true;
         }
         value.number = std::strtod((plain + "e" + std::to_string(shift)).c_str(), nullptr);
-        return finite(value.number) || fail("HEADER_NUMBER", "a number is not finite as a double", begin);
+        return finite(value.number) || unfit(begin);
+    }
+
+    // Keeps the place of a number that is too large; the syntax of what follows counts first.
+    bool unfit(std::size_t begin) noexcept {
+        beyond = (std::min)(beyond, begin);
+        return true;
     }
 
     const char* text;
     std::size_t size, at = 0;
+    std::size_t twice = std::size_t(-1), beyond = std::size_t(-1);
 };
 
 // What a value of the header must be.
@@ -728,12 +755,15 @@ inline bool obeys(const Value& v, const Key& key) {
             return array && v.items.size() == 17 && all([&key](const Value& item) { return is_number(item, key); });
         case Kind::edges:
             return array && v.items.size() >= 2 && v.items.size() <= 65537 &&
-                   all([](const Value& item) { return item.type == Type::number; });
+                   all([&key](const Value& item) { return is_number(item, key); });
     }
     return false;
 }
 
 constexpr double inf = std::numeric_limits<double>::infinity();
+constexpr double largest = 1e30;                        // magnitude of any number but integers
+constexpr double slack = 1e-9, upmost = 1.000000001;    // statistics are sums of many numbers, and rounded
+constexpr double below_one = 0x1.fffffffffffffp-1;
 // Joint records begin after the blocks that are required; what is new in 1.1, records by entry, after those.
 constexpr int block_names = 20, required_blocks = 6, old_blocks = 12;
 
@@ -949,7 +979,8 @@ class Reader {
                             {"fits", Kind::object}, {"energy_ledger", Kind::object}, {"provenance", Kind::object},
                             {"licence", Kind::line}}) ||
             !object(*h.find("columns"), "/columns",
-                    {{"quantity", Kind::one_of, 0, false, 0, "|cos_theta|"}, {"edges", Kind::edges}}))
+                    {{"quantity", Kind::one_of, 0, false, 0, "|cos_theta|"},
+                     {"edges", Kind::edges, -largest, false, largest}}))
             return false;
         const Value& blocks = *h.find("blocks");
         if (blocks.type != Value::Type::array || blocks.items.empty() || blocks.items.size() > 64)
@@ -960,49 +991,49 @@ class Reader {
         const Value& grain = *h.find("grain");
         if (!object(grain, "/grain",
                     {{"kind", Kind::one_of, 0, false, 0, "|sphere|mesh|"}, {"name", Kind::line},
-                     {"parameters", Kind::object}, {"bounding_radius", Kind::number, 0, true},
-                     {"area", Kind::number, 0, true}, {"volume", Kind::number, 0, true}, {"convex", Kind::boolean},
-                     {"bodies", Kind::integer, 1}, {"faces", Kind::integer, 0}, {"mesh_sha256", Kind::sha256_or_null},
+                     {"parameters", Kind::object}, {"bounding_radius", Kind::number, 0, true, largest},
+                     {"area", Kind::number, 0, true, largest}, {"volume", Kind::number, 0, true, largest},
+                     {"convex", Kind::boolean}, {"bodies", Kind::integer, 1}, {"faces", Kind::integer, 0},
+                     {"mesh_sha256", Kind::sha256_or_null},
                      {"notes", Kind::lines, -inf, false, 256}}))
             return false;
         if (grain.find("parameters")->items.size() > 256) return broken("more than 256 keys", "/grain/parameters");
         const Value& optics = *h.find("optics");
         if (!object(optics, "/optics",
-                    {{"eta", Kind::number, 0, true}, {"fresnel", Kind::one_of, 0, false, 0, "|un|sp|"},
-                     {"material", Kind::line_or_null}, {"wavelength_nm", Kind::number_or_null, 0, true},
-                     {"k", Kind::number_or_null, 0}, {"source", Kind::line_or_null}}))
+                    {{"eta", Kind::number, 1e-30, false, largest}, {"fresnel", Kind::one_of, 0, false, 0, "|un|sp|"},
+                     {"material", Kind::line_or_null}, {"wavelength_nm", Kind::number_or_null, 0, true, largest},
+                     {"k", Kind::number_or_null, 0, false, largest}, {"source", Kind::line_or_null}}))
             return false;
         table.bounding_radius = grain.find("bounding_radius")->number;
         table.eta = optics.find("eta")->number;
 
-        if (!statistics(*h.find("statistics"), "/statistics", -inf, table.statistics) ||
-            !statistics(*h.find("standard_errors"), "/standard_errors", 0.0, table.standard_errors) ||
+        const auto stated = [](const char* key) { return Key{key, Kind::number, 0, false, largest}; };
+        if (!statistics(*h.find("statistics"), "/statistics", false, table.statistics) ||
+            !statistics(*h.find("standard_errors"), "/standard_errors", true, table.standard_errors) ||
             !object(*h.find("table_error"), "/table_error",
-                    {{"total_variation", Kind::number, 0}, {"sampling_noise", Kind::number, 0},
-                     {"cell_width", Kind::number, 0}}))
+                    {stated("total_variation"), stated("sampling_noise"), stated("cell_width")}))
             return false;
         const Value& factors = *h.find("factorisation_error");
         const std::string place = "/factorisation_error";
+        const auto bits = [](const char* key) { return Key{key, Kind::number, -largest, false, largest}; };
         if (!object(factors, place,
-                    {{"mutual_information_bits", Kind::object}, {"total_variation", Kind::number, 0},
-                     {"total_variation_noise", Kind::number, 0}, {"impossible_offsets", Kind::number, 0},
-                     {"mean_offset", Kind::number, 0}, {"mean_offset_factorised", Kind::number, 0},
-                     {"resolution", Kind::object}}) ||
+                    {{"mutual_information_bits", Kind::object}, stated("total_variation"),
+                     stated("total_variation_noise"), stated("impossible_offsets"), stated("mean_offset"),
+                     stated("mean_offset_factorised"), {"resolution", Kind::object}}) ||
             !object(*factors.find("mutual_information_bits"), place + "/mutual_information_bits",
-                    {{"r_z", Kind::number}, {"r_phi", Kind::number}, {"z_phi", Kind::number}, {"r_l", Kind::number},
-                     {"z_l", Kind::number}, {"phi_l", Kind::number}}) ||
+                    {bits("r_z"), bits("r_phi"), bits("z_phi"), bits("r_l"), bits("z_l"), bits("phi_l")}) ||
             !object(*factors.find("resolution"), place + "/resolution",
                     {{"theta", Kind::integer, 1, false, 65536}, {"phi", Kind::integer, 1, false, 65536},
                      {"r", Kind::integer, 1, false, 65536}, {"z", Kind::integer, 1, false, 65536},
                      {"l", Kind::integer, 1, false, 65536}}))
             return false;
         const Value& fits = *h.find("fits");
+        const auto lobe = [](const char* key) { return Key{key, Kind::number, -1, true, below_one}; };
         return object(fits, "/fits", {{"henyey_greenstein", Kind::object}, {"two_lobe", Kind::object}}) &&
                object(*fits.find("henyey_greenstein"), "/fits/henyey_greenstein",
-                      {{"g", Kind::number}, {"total_variation", Kind::number, 0}}) &&
+                      {lobe("g"), stated("total_variation")}) &&
                object(*fits.find("two_lobe"), "/fits/two_lobe",
-                      {{"g1", Kind::number}, {"g2", Kind::number}, {"weight", Kind::number, 0, false, 1},
-                       {"total_variation", Kind::number, 0}}) &&
+                      {lobe("g1"), lobe("g2"), {"weight", Kind::number, 0, false, 1}, stated("total_variation")}) &&
                object(*h.find("energy_ledger"), "/energy_ledger",
                       {{"launched", Kind::integer, 0}, {"unscattered", Kind::integer, 0},
                        {"scattered", Kind::integer, 0}, {"absorbed", Kind::integer, 0},
@@ -1015,7 +1046,7 @@ class Reader {
 
     bool block_schema(const Value& v, const std::string& place) {
         const Key name{"name", Kind::line}, first{"first_row", Kind::integer, 0, false, 65535},
-            rows{"rows", Kind::integer, 1, false, 65536}, edges{"edges", Kind::edges};
+            rows{"rows", Kind::integer, 1, false, 65536}, edges{"edges", Kind::edges, -largest, false, largest};
         if (!object(v, place, {name, first, rows}, true)) return false;
         const std::string& text = v.find("name")->text;
         if (text.empty() || text.size() > 64 ||
@@ -1046,13 +1077,18 @@ class Reader {
                                  word_of("unit", unit[i]), edges});
     }
 
-    bool statistics(const Value& v, const std::string& place, double low, Statistics& into) {
+    bool statistics(const Value& v, const std::string& place, bool errors, Statistics& into) {
+        const auto within = [errors](const char* name, double low, double high, bool above = false) {
+            return errors ? Key{name, Kind::number, 0, false, largest} : Key{name, Kind::number, low, above, high};
+        };
+        const Key moments = errors ? Key{"legendre_moments", Kind::moments, 0, false, largest}
+                                   : Key{"legendre_moments", Kind::moments, -upmost, false, upmost};
         if (!object(v, place,
-                    {{"hit_probability", Kind::number, low}, {"albedo", Kind::number, low},
-                     {"mean_cosine", Kind::number, low}, {"mean_z", Kind::number, low}, {"mean_r", Kind::number, low},
-                     {"mean_miss_chord", Kind::number, low}, {"mean_path_length", Kind::number, low},
-                     {"atom_forward", Kind::number, low}, {"atom_backward", Kind::number, low},
-                     {"legendre_moments", Kind::moments, low}}))
+                    {within("hit_probability", 0, upmost, true), within("albedo", 0, upmost, true),
+                     within("mean_cosine", -upmost, upmost), within("mean_z", -upmost, 2.000000001),
+                     within("mean_r", -slack, 2.000000001), within("mean_miss_chord", -slack, 2.000000001),
+                     within("mean_path_length", 0, largest), within("atom_forward", -slack, upmost),
+                     within("atom_backward", -slack, upmost), moments}))
             return false;
         const auto number = [&v](const char* key) { return v.find(key)->number; };
         into.hit_probability = number("hit_probability");
@@ -1097,6 +1133,18 @@ class Reader {
         }
         if (rest != 0)
             return fail("HEADER_LEDGER", "launched is not the sum of the others", "/energy_ledger/launched");
+        const std::int64_t launched = ledger.find("launched")->integer;
+        const std::int64_t met = launched - ledger.find("unscattered")->integer;
+        const std::int64_t scattered = ledger.find("scattered")->integer;
+        const auto share = [](double stated, std::int64_t part, std::int64_t whole) {
+            const double expected = stated * double(whole);
+            return part > 0 && std::abs(expected - double(part)) <= 1e-3 * expected;
+        };
+        if (!share(table.statistics.hit_probability, met, launched))
+            return fail("HEADER_STATISTICS", "hit_probability is not that of the energy ledger",
+                        "/statistics/hit_probability");
+        if (!share(table.statistics.albedo, scattered, met))
+            return fail("HEADER_STATISTICS", "albedo is not that of the energy ledger", "/statistics/albedo");
 
         const std::vector<Value>& blocks = table.header.find("blocks")->items;
         std::size_t next = 0;
@@ -1181,6 +1229,8 @@ class Reader {
         std::size_t at = header_end + 8 * count;
         Sha256 sha;
         Bytes plain, woven;
+        // Not more than the bytes that are there can inflate to
+        table.pixels.reserve((std::min)(table.rows * table.columns, 1040 * (size - header_end) / 4));
         for (std::size_t i = 0; i < count; ++i) {
             const std::string place = at_byte(at);
             const auto bad = [&] { return fail("EXR_CHUNK", "a chunk is not what it should be", place); };
@@ -1254,14 +1304,55 @@ class Reader {
         }
         const auto outside = [&](size_t y, size_t x, float value) {
             if (table.row(table.p_l.first_row + y)[x] == 0.0f) return value != 0.0f;
-            const double mean = double(value), upper = y + 1 < table.p_l.rows ? table.p_l.edges[y + 1] : inf;
+            const double mean = double(value), upper = y + 1 < table.p_l.rows ? table.p_l.edges[y + 1] : largest;
             return mean * (1.0 + 1e-6) < table.p_l.edges[y] || mean * (1.0 - 1e-6) > upper;
         };
         if (!sound(5, "VALUE_MEAN_RANGE", "outside its cell or of no mass", outside)) return false;
         // Blocks of the joint records, and of the records by entry: r, z, phi_delta, entry_b2, entry_azimuth
         static constexpr int of_joint[] = {6, 7, 8, 10, 11}, of_memory[] = {15, 16, 17, 19, 14};
         return (table.records == 0 || records(required_blocks, old_blocks, of_joint)) &&
-               (table.memory_records == 0 || memory(of_memory));
+               (table.memory_records == 0 || memory(of_memory)) && means();
+    }
+
+    // Whether the statistics are those that the masses of the cells allow, whatever lies where in a cell.
+    bool means() {
+        using std::size_t;
+        const float* p = table.row(table.p_theta.first_row);
+        const Statistics& s = table.statistics;
+        const auto near = [&](const char* key, double stated, double low, double high, double unit_of = 1.0) {
+            if (stated >= low - 0.02 * unit_of && stated <= high + 0.02 * unit_of) return true;
+            return fail("VALUE_STATISTICS", std::string(key) + " is not that of the blocks",
+                        std::string("/statistics/") + key);
+        };
+        // Least and largest mean that masses of cells allow
+        const auto bounds = [](const std::vector<double>& edges, auto mass) {
+            std::pair<double, double> made{0.0, 0.0};
+            for (size_t i = 0; i + 1 < edges.size(); ++i) {
+                made.first += edges[i] * mass(i);
+                made.second += edges[i + 1] * mass(i);
+            }
+            return made;
+        };
+        const auto of_block = [&](const Block& b) {
+            return bounds(b.edges, [&](size_t y) {
+                double sum = 0.0;
+                for (size_t x = 0; x < table.columns; ++x) sum += double(table.row(b.first_row + y)[x]) * double(p[x]);
+                return sum;
+            });
+        };
+        const auto cosine = bounds(table.cos_theta_edges, [&](size_t x) { return double(p[x]); });
+        const auto r = of_block(table.p_r), z = of_block(table.p_z);
+        double length = 0.0;
+        for (size_t y = 0; y < table.p_l.rows; ++y)
+            for (size_t x = 0; x < table.columns; ++x)
+                length += double(table.row(table.p_l.first_row + y)[x]) *
+                          double(table.row(table.mean_l.first_row + y)[x]) * double(p[x]);
+        const double back = double(p[0]), forth = double(p[table.columns - 1]);
+        return near("atom_backward", s.atom_backward, back, back) &&
+               near("atom_forward", s.atom_forward, forth, forth) &&
+               near("mean_cosine", s.mean_cosine, cosine.first, cosine.second) &&
+               near("mean_r", s.mean_r, r.first, r.second) && near("mean_z", s.mean_z, z.first, z.second) &&
+               near("mean_path_length", s.mean_path_length, length, length, (std::max)(1.0, length));
     }
 
     bool memory(const int (&of_memory)[5]) {
@@ -1285,16 +1376,14 @@ class Reader {
     // Rules of the records in the blocks from `first` to before `end`; `of` as in `values`.
     bool records(int first, int end, const int (&of)[5]) {
         using std::size_t;
-        static constexpr float turn = 3.14159274f;  // pi as float32
-        static constexpr float none = std::numeric_limits<float>::infinity();
-        static constexpr float low[] = {0.0f, -1.0f, -turn, 0.0f, 0.0f, -turn, 0.0f,  // joint records, memory_hit,
-                                        -1.0f, -turn, 0.0f, -1.0f, -turn, 0.0f, 0.0f};  // records by entry
-        static constexpr float high[] = {2.0f, 2.0f, turn, none, 1.0f, turn, 1.0f,
-                                         1.0f, turn, 2.0f, 2.0f, turn, none, 1.0f};
+        constexpr double turn = double(3.14159274f);  // pi as float32
+        static constexpr double low[] = {0, -1, -turn, 0, 0, -turn, 0,  // joint records, memory_hit,
+                                         -1, -turn, 0, -1, -turn, 0, 0};  // records by entry
+        static constexpr double high[] = {2, 2, turn, largest, 1, turn, 1, 1, turn, 2, 2, turn, largest, 1};
         for (int k = first; k < end; ++k) {
             const int i = k - required_blocks;
             const auto outside = [&](size_t, size_t x, float v) {
-                return v < low[i] - 1e-6f || v > high[i] + 1e-6f ||
+                return double(v) < low[i] - 1e-6 || double(v) > high[i] + 1e-6 ||
                        (i == 5 && v != 0.0f && (x == 0 || x + 1 == table.columns));
             };
             if (!sound(k, "VALUE_RECORD_RANGE", "out of range", outside)) return false;

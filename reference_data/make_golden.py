@@ -306,6 +306,25 @@ def valid() -> dict[str, bytes]:
     newer["blocks"].append({"name": "p_spin", "kind": "spin", "first_row": len(newer_pixels), "rows": 2})
     newer_pixels = np.concatenate([newer_pixels, np.full((2, 4), -0.25, dtype="<f4")])
 
+    much_newer, much_newer_pixels = table(WEIGHTS)
+    much_newer["format_version"] = "1.10000"
+    for i in range(64 - len(much_newer["blocks"])):
+        name = f"new_{i}".ljust(64, "_")
+        much_newer["blocks"].append({"name": name, "first_row": len(much_newer_pixels), "rows": 1})
+        much_newer_pixels = np.concatenate([much_newer_pixels, np.full((1, 4), i, dtype="<f4")])
+    much_newer["grain"]["notes"] = [f"note {i}" for i in range(256)]
+    much_newer["grain"]["parameters"] = {f"parameter_{i}": i for i in range(256)}
+
+    rounded, rounded_pixels = table([1, 1, 2, 4, 6, 2], count=8, joint=True, memory=4)
+    first = {block["name"]: block["first_row"] for block in rounded["blocks"]}
+    rounded_pixels[first["joint_r"], 1] -= np.float32(5e-4)  # of the 2e-3 by which an exit may miss the sphere
+    for field in ("r", "z", "phi_delta"):
+        rounded_pixels[first[f"memory_{field}"] + 3, 1] = 0.0
+    rounded_pixels[first["memory_entry_b2"] + 3, 1] = np.float32(1 / 3 + 8e-7)  # of a cell that ends at 1/3
+    rounded_pixels[first["memory_cos_theta"], 1] = np.float32(1.0 + 8e-7)
+    rounded["statistics"]["legendre_moments"][0] = 1.0 + 5e-10
+    rounded["statistics"]["mean_z"] += 0.015  # of the 0.02 by which it may be off
+
     return {
         "minimal": file(*table(WEIGHTS)),
         "records": file(*table([1, 1, 2, 4, 6, 2], count=8, joint=True)),
@@ -316,6 +335,9 @@ def valid() -> dict[str, bytes]:
         "newer_minor": file(newer, newer_pixels),
         "many_rows": file(*table([1, 1, 2, 4, 6, 2], phi=16, other=12, count=16, joint=True)),
         "raw_chunk": file(*table(WEIGHTS, other=3)),
+        "much_newer_minor": file(much_newer, much_newer_pixels),
+        "rounded": file(rounded, rounded_pixels),
+        "straight_on": file(*table([0, 0, 0, 1])),
     }
 
 
@@ -402,6 +424,12 @@ def invalid() -> dict[str, bytes]:
     for depth in (32, 2000):
         deep = b',"x_deep":' + b"[" * depth + b"]" * depth + b"}"
         header_text(f"HEADER_DEPTH-{depth + 1}", whole[:-1] + deep)
+    # Of several faults: depth, then syntax, then keys, then numbers, wherever each stands.
+    twice, large = b',"eta":1,"eta":2', b',"x_":1e999'
+    header_text("HEADER_DEPTH-before_syntax", whole[:-1] + large + b',"x":"' + b"[" * 40 + b'","y":]' + b"[" * 34)
+    header_text("HEADER_JSON-before_number", whole[:-1] + large + twice + b"]")
+    header_text("HEADER_DUPLICATE_KEY-before_number", whole[:-1] + large + twice + b"}")
+    header_text("HEADER_NUMBER-before_version", (whole[:-1] + large + b"}").replace(b'"1.0"', b'"2.0"'))
 
     # The meaning of the header, and of the pixels.
     def edit(
@@ -423,6 +451,8 @@ def invalid() -> dict[str, bytes]:
     edit("VERSION_SYNTAX-number", at("format_version", 1.0))
     edit("VERSION_SYNTAX-text", at("format_version", "1.0\n"))
     edit("VERSION_MAJOR", at("format_version", "2.0"))
+    edit("VERSION_SYNTAX-leading_zero", at("format_version", "1.01"))
+    edit("VERSION_MAJOR-5000_digits", at("format_version", "1" * 5000 + ".0"))
     made["VERSION_MAJOR-before_hash"] = made["VERSION_MAJOR"][:-1]
     edit("VERSION_FEATURE", at("required_features", ["fluorescence"]))
     newer, newer_pixels = table(WEIGHTS)
@@ -444,7 +474,25 @@ def invalid() -> dict[str, bytes]:
     edit("HEADER_SCHEMA-memory_unit", at("unit", "R", "blocks", -1), memory, memory_pixels)
     edit("HEADER_SCHEMA-not_in_1_1", at("polarisation", "unknown to 1.1"), memory, memory_pixels)
     edit("HEADER_SCHEMA-many", at("optics", {"eta": -1, "fresnel": "s"}))
+    for key, value in (
+        ("hit_probability", 0), ("hit_probability", 5), ("albedo", 0.0), ("albedo", -1), ("mean_cosine", 1.001),
+        ("mean_z", -100), ("mean_r", 2.1), ("mean_miss_chord", -1), ("mean_path_length", -0.5), ("atom_forward", 2),
+        ("mean_path_length", 1e31), ("legendre_moments", [2] * 17),
+    ):  # fmt: skip
+        shown = "17_of_2" if isinstance(value, list) else str(value).replace("-", "minus_")
+        edit(f"HEADER_SCHEMA-{key}_{shown}", at(key, value, "statistics"))
+    edit("HEADER_SCHEMA-standard_error", at("mean_z", 1e300, "standard_errors"))
+    edit("HEADER_SCHEMA-fit", at("g", 1, "fits", "henyey_greenstein"))
+    edit("HEADER_SCHEMA-eta", at("eta", 1e-200, "optics"))
+    edit("HEADER_SCHEMA-edge", at("edges", [0.0, 0.0, 0.5, 1e300], "blocks", 4))
+    edit("HEADER_SCHEMA-65_blocks", at("blocks", [*plain["blocks"]] * 11))
+    edit("HEADER_SCHEMA-257_notes", at("notes", [""] * 257, "grain"))
+    edit("HEADER_SCHEMA-257_parameters", at("parameters", {str(i): i for i in range(257)}, "grain"))
+    edit("HEADER_SCHEMA-features", at("required_features", {}))
     edit("HEADER_LEDGER", at("lost", 1, "energy_ledger"))
+    edit("HEADER_STATISTICS-hit_probability", at("hit_probability", 0.64, "statistics"))
+    edit("HEADER_STATISTICS-albedo", at("albedo", 0.5, "statistics"))
+    edit("HEADER_STATISTICS-no_light", at("energy_ledger", dict.fromkeys(plain["energy_ledger"], 0)))
     edit("MANIFEST_ROWS-overlap", at("first_row", 2, "blocks", 2))
     edit("MANIFEST_HEIGHT", lambda header: header, plain, np.concatenate([plain_pixels, plain_pixels[-1:]]))
     edit(
@@ -504,6 +552,10 @@ def invalid() -> dict[str, bytes]:
         changed[header["blocks"][block]["first_row"] + row, column] = value
         made[name] = file(header, changed)
 
+    for key, value in (("mean_cosine", -0.5), ("mean_z", -0.9), ("mean_r", 0.0), ("mean_path_length", 9.0),
+                       ("atom_backward", 0.25), ("atom_forward", 0.0)):  # fmt: skip
+        edit(f"VALUE_STATISTICS-{key}", at(key, value, "statistics"), joint, joint_pixels)
+
     pixel("VALUE_NOT_FINITE-nan", 2, 0, 1, math.nan)
     pixel("VALUE_NOT_FINITE-inf", 9, 7, 5, math.inf)
     pixel("VALUE_NEGATIVE", 0, 0, 1, -0.0625)
@@ -513,7 +565,10 @@ def invalid() -> dict[str, bytes]:
     emptied[0, 2:4] = 0.0, emptied[0, 2:4].sum()
     made["VALUE_EMPTY_COLUMN"] = file(joint, emptied)
     pixel("VALUE_MEAN_RANGE", 5, 1, 2, 1.75)
+    pixel("VALUE_MEAN_RANGE-longest", 5, 2, 4, 1e31)
+    pixel("VALUE_RECORD_RANGE-longest", 9, 7, 4, 1e31)
     pixel("VALUE_RECORD_RANGE-b2", 10, 7, 2, 1.5)
+    pixel("VALUE_RECORD_RANGE-rounding", 7, 7, 2, -1.0 - 1.1e-6)
     pixel("VALUE_RECORD_RANGE-atom", 11, 3, 0, 0.5)
     pixel("VALUE_RECORD_ORDER", 10, 2, 2, 0.0625)
     flipped = joint_pixels.copy()
@@ -532,9 +587,13 @@ def invalid() -> dict[str, bytes]:
     by_entry("VALUE_RECORD_RANGE-cos_theta", "cos_theta", 1, 3, -1.25)
     by_entry("VALUE_RECORD_ORDER-memory", "entry_b2", 2, 2, 0.34375)
     by_entry("VALUE_RECORD_SPHERE-memory", "phi_delta", 2, 2, 0.3125)
-    strayed, first = memory_pixels.copy(), memory["blocks"][13]["first_row"]
-    strayed[first:, 2:4] = strayed[first:, 3:1:-1].copy()
+    strayed, records_from = memory_pixels.copy(), memory["blocks"][13]["first_row"]
+    strayed[records_from:, 2:4] = strayed[records_from:, 3:1:-1].copy()
     made["VALUE_MEMORY_CELL"] = file(memory, strayed)
+    rounded, first = memory_pixels.copy(), {block["name"]: block["first_row"] for block in memory["blocks"]}
+    for field, value in (("r", 0.0), ("z", 0.0), ("entry_b2", 1 / 3 + 1.2e-6)):
+        rounded[first[f"memory_{field}"] + 3, 1] = value
+    made["VALUE_MEMORY_CELL-rounding"] = file(memory, rounded)
     by_entry("VALUE_MEMORY_EMPTY", "l", 0, 4, 0.5)
     return made
 

@@ -139,7 +139,7 @@ def test_the_schema_is_one() -> None:
     for name, data in VALID.items():
         made = fmt.inspect(data)[0]
         assert made is not None
-        assert name == "newer_minor" or Draft202012Validator(schema).is_valid(thawed(made.header))
+        assert "newer" in name or Draft202012Validator(schema).is_valid(thawed(made.header))
 
     def keys(part: object) -> set[str]:
         if isinstance(part, list):
@@ -160,7 +160,7 @@ def test_a_chunk_is_stored_raw() -> None:
 # --- writing -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [name for name in VALID if name != "newer_minor"])
+@pytest.mark.parametrize("name", [name for name in VALID if "newer" not in name])
 def test_round_trip(name: str, tmp_path: Path) -> None:
     """What is written is read back; twice the same bytes; the EXR header is the golden script's."""
     one, two = tmp_path / "one.tsdf.exr", tmp_path / "two.tsdf.exr"

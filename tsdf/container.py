@@ -301,7 +301,7 @@ def _table(data: bytes, form: Format[Held], findings: list[Finding]) -> Held | N
     if _collect(findings, form, form.manifest(header, width, height, newer)):
         return None
     pixels = _pixels(data, end, width, height)
-    if hashlib.sha256(pixels.tobytes()).hexdigest() != header["pixels_sha256"]:
+    if hashlib.sha256(pixels.data).hexdigest() != header["pixels_sha256"]:
         raise FormatError("HASH_PIXELS", "the pixels are not those announced", "/pixels_sha256")
     table = form.make(header, pixels)
     return None if _collect(findings, form, form.values(table)) else table
@@ -359,56 +359,58 @@ def _text(data: bytes, at: int) -> tuple[str, int]:
 
 
 def _header(attribute: Attribute) -> dict[str, Any]:
-    """Return the header, parsed without faith in its author."""
+    """Return the header, parsed without faith in its author: its depth, then its syntax, then its keys and numbers."""
     place = f"bytes {attribute.at}"
-    too_deep = FormatError("HEADER_DEPTH", f"the header nests deeper than {MAX_DEPTH}", place)
+    if _depth(attribute.value) > MAX_DEPTH:
+        raise FormatError("HEADER_DEPTH", f"the header nests deeper than {MAX_DEPTH}", place)
+    broken: dict[str, str] = {}  # first message by code; a syntax error further on comes before
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        made = dict(pairs)
+        if len(made) < len(pairs):
+            seen: set[str] = set()
+            twice = next(name for name, _ in pairs if name in seen or seen.add(name))  # type: ignore[func-returns-value]
+            broken.setdefault("HEADER_DUPLICATE_KEY", f"an object has the key {shown(ascii(twice))} twice")
+        return made
+
+    def integer(text: str) -> int:
+        if len(text) > 20 or abs(value := int(text)) >= 2**63:
+            broken.setdefault("HEADER_NUMBER", f"{shown(text, 30)} does not fit 64 bits")
+            return 0
+        return value
+
+    def double(text: str) -> float:
+        if not math.isfinite(value := float(text)):
+            broken.setdefault("HEADER_NUMBER", f"{shown(text, 30)} is not finite as a double")
+            return 0.0
+        return value
+
     try:
         header = json.loads(
             attribute.value.decode("ascii"),
-            object_pairs_hook=_unique,
-            parse_int=_integer,
-            parse_float=_double,
+            object_pairs_hook=unique,
+            parse_int=integer,
+            parse_float=double,
             parse_constant=_no_constant,
         )
-        level, depth = [header], 0
-        while level := [value for value in level if isinstance(value, dict | list)]:
-            depth += 1
-            if depth > MAX_DEPTH:
-                raise too_deep
-            level = [item for value in level for item in (value.values() if isinstance(value, dict) else value)]
         json.dumps(header, ensure_ascii=False).encode()  # refuses half a surrogate pair
-    except RecursionError:
-        raise too_deep from None
-    except FormatError as error:  # from a hook, which does not know the place
-        raise FormatError(error.code, error.reason, place) from None
     except ValueError as error:
         if isinstance(error, json.JSONDecodeError):
             place = f"bytes {attribute.at + error.pos}"
         raise FormatError("HEADER_JSON", shown(error), place) from None
     if not isinstance(header, dict):
         raise FormatError("HEADER_JSON", "the header is not a JSON object", place)
+    for code in ("HEADER_DUPLICATE_KEY", "HEADER_NUMBER"):
+        if code in broken:
+            raise FormatError(code, broken[code], place)
     return header
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    made = dict(pairs)
-    if len(made) < len(pairs):
-        seen: set[str] = set()
-        twice = next(name for name, _ in pairs if name in seen or seen.add(name))  # type: ignore[func-returns-value]
-        raise FormatError("HEADER_DUPLICATE_KEY", f"an object has the key {shown(ascii(twice))} twice")
-    return made
-
-
-def _integer(text: str) -> int:
-    if len(text) > 20 or abs(value := int(text)) >= 2**63:
-        raise FormatError("HEADER_NUMBER", f"{shown(text, 30)} does not fit 64 bits")
-    return value
-
-
-def _double(text: str) -> float:
-    if not math.isfinite(value := float(text)):
-        raise FormatError("HEADER_NUMBER", f"{shown(text, 30)} is not finite as a double")
-    return value
+def _depth(text: bytes) -> int:
+    """Return how many brackets are open at most, outside strings, whatever else is wrong with the text."""
+    bare = np.frombuffer(re.sub(rb'"(?:[^"\\]++|\\.)*+"?', b"", text, flags=re.DOTALL), dtype=np.uint8)
+    steps = np.isin(bare, list(b"[{")).astype(np.int64) - np.isin(bare, list(b"]}"))
+    return int(np.cumsum(steps).max(initial=0))
 
 
 def _no_constant(text: str) -> float:
@@ -418,13 +420,14 @@ def _no_constant(text: str) -> float:
 def _version(header: Mapping[str, Any], form: Format[Any], findings: list[Finding]) -> bool:
     """Return whether the file follows a newer minor version, of which unknown keys and blocks are ignored."""
     version = header.get("format_version")
-    known_major, known_minor = map(int, form.version.split("."))
-    number = "(0|[1-9][0-9]{0,3})"
+    known_major, known_minor = form.version.split(".")
+    number = "(0|[1-9][0-9]*)"
     match = re.fullmatch(rf"{number}\.{number}", version if isinstance(version, str) else "")
     if header.get("format") != form.name or not match:
         message = f'format is not "{form.name}" or format_version not MAJOR.MINOR'
         raise FormatError("VERSION_SYNTAX", message, "/format_version" if not match else "/format")
-    major, minor = map(int, match.groups())
+    major, minor = match.groups()  # of any number of digits, and so compared as text
+    version = shown(version, 30)
     if major != known_major:
         message = f"the file has format version {version}, this reads {form.version}"
         raise FormatError("VERSION_MAJOR", message, "/format_version")
@@ -432,10 +435,11 @@ def _version(header: Mapping[str, Any], form: Format[Any], findings: list[Findin
     if isinstance(features, list) and features:
         message = f"the file needs the feature {shown(ascii(features[0]))}, unknown here"
         raise FormatError("VERSION_FEATURE", message, "/required_features/0")
-    if minor > known_minor:
+    newer = (len(minor), minor) > (len(known_minor), known_minor)
+    if newer:
         message = f"format version {version} is newer than {form.version}, and what is new is ignored"
         _collect(findings, form, iter([("VERSION_MINOR", "/format_version", message)]))
-    return minor > known_minor
+    return newer
 
 
 def _check_digest(data: bytes, attributes: Mapping[str, Attribute], name: str) -> None:
@@ -502,15 +506,17 @@ def _pixels(data: bytes, at: int, width: int, height: int) -> np.ndarray:
         raise FormatError("EXR_TRUNCATED", "the file ends too early", f"bytes {at}")
     offsets = struct.unpack_from(f"<{count}Q", data, at)
     place = at + 8 * count
-    chunks = []
+    pixels = bytearray()  # grows with what is there, not with what the header claims
     for i, offset in enumerate(offsets):
         lines = min(LINES_PER_CHUNK, height - i * LINES_PER_CHUNK)
         chunk, length = _unpack(data, place, 4 * width * lines, i * LINES_PER_CHUNK, offset)
-        chunks.append(chunk)
+        pixels += chunk
         place += length
     if place != len(data):
         raise FormatError("EXR_TRAILING", f"{len(data) - place} bytes after the last chunk", f"bytes {place}")
-    return np.frombuffer(b"".join(chunks), dtype="<f4").reshape(height, width)
+    array = np.frombuffer(pixels, dtype="<f4").reshape(height, width)
+    array.flags.writeable = False
+    return array
 
 
 def _unpack(data: bytes, at: int, size: int, y: int, offset: int) -> tuple[bytes, int]:

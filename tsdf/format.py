@@ -6,7 +6,7 @@ table is stands in `table`; whether its numbers are plausible physics, in `valid
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -20,11 +20,11 @@ from tsdf.table import CONDITIONALS, FORMAT_VERSION, MEMORY_FIELDS, RECORD_FIELD
 # code: (severity, rule). The set is closed; SPEC.md lists it and `reference_data/golden` breaks each of them.
 CODES = container.rules("tsdf", "tsdf", "header.schema.json") | {
     "HEADER_LEDGER": ("error", "energy launched is the exact sum of the other entries of the ledger"),
+    "HEADER_STATISTICS": ("error", "hit_probability and albedo are those of the energy ledger within 1e-3 of them"),
     "MANIFEST_ROWS": ("error", "each block begins at the row at which the one before it ends"),
-    "MANIFEST_HEIGHT": ("error", "the rows of all blocks are as many as the image has"),
-    "MANIFEST_WIDTH": ("error", "the image has as many columns as there are cells of cos theta"),
     "MANIFEST_DUPLICATE": ("error", "no block occurs twice"),
     "MANIFEST_UNKNOWN": ("error", "a file of version 1.0 or 1.1 has only the blocks of its version"),
+    "MANIFEST_HEIGHT": ("error", "the rows of all blocks are as many as the image has"),
     "MANIFEST_MISSING": ("error", "p_theta, p_phi, p_r, p_z, p_l and mean_l are present"),
     "MANIFEST_ORDER": ("error", "the blocks stand in the order of the specification"),
     "MANIFEST_MEAN": ("error", "mean_l has as many rows as p_l"),
@@ -36,9 +36,10 @@ CODES = container.rules("tsdf", "tsdf", "header.schema.json") | {
         "error",
         "memory_hit and seven memory blocks with the same number of rows are all present, or all absent",
     ),
+    "MANIFEST_WIDTH": ("error", "the image has as many columns as there are cells of cos theta"),
     "MANIFEST_EDGE_COUNT": ("error", "a block of masses has one edge more than rows"),
-    "MANIFEST_EDGE_ORDER": ("error", "edges ascend; exactly the cells that are atoms have zero width"),
     "MANIFEST_EDGE_ENDS": ("error", "the edges of an axis span its whole range"),
+    "MANIFEST_EDGE_ORDER": ("error", "edges ascend; exactly the cells that are atoms have zero width"),
     "VALUE_NOT_FINITE": ("error", "every pixel of a known block is finite"),
     "VALUE_NEGATIVE": ("error", "masses and means are not negative"),
     "VALUE_P_THETA_SUM": ("error", "p_theta sums to 1 within 1e-5"),
@@ -47,17 +48,25 @@ CODES = container.rules("tsdf", "tsdf", "header.schema.json") | {
         "each conditional sums to 1 within 1e-5 in every column that p_theta can draw",
     ),
     "VALUE_EMPTY_COLUMN": ("error", "a column of which p_theta is 0 is 0 throughout"),
-    "VALUE_MEAN_RANGE": ("error", "mean_l lies in its cell of p_l, and is 0 where the mass is 0"),
-    "VALUE_RECORD_RANGE": ("error", "records lie in their ranges; entry_azimuth is 0 in the atoms of joint records"),
+    "VALUE_MEAN_RANGE": ("error", "mean_l lies in its cell of p_l within 1e-6 of it, and is 0 where the mass is 0"),
+    "VALUE_RECORD_RANGE": (
+        "error",
+        "records lie in their ranges within 1e-6; in the atoms of joint records entry_azimuth is 0",
+    ),
     "VALUE_RECORD_ORDER": ("error", "the records of a column ascend in entry_b2"),
     "VALUE_RECORD_SPHERE": ("error", "entry and exit of every record lie on the bounding sphere within 2e-3"),
     "VALUE_MEMORY_HIT": ("error", "memory_hit is a probability"),
-    "VALUE_MEMORY_CELL": ("error", "entry_b2 of every record by entry lies in the cell of its column"),
+    "VALUE_MEMORY_CELL": ("error", "entry_b2 of every record by entry lies in the cell of its column within 1e-6"),
     "VALUE_MEMORY_EMPTY": ("error", "records by entry are 0 where memory_hit is"),
+    "VALUE_STATISTICS": ("error", "atoms and means of the statistics are those of the blocks within 0.02"),
 }
 
 SUM_TOLERANCE = 1e-5  # of float32 masses summed in double
-CELL_TOLERANCE = 1e-6  # [R^2] of entry_b2 rounded to float32
+ROUNDING = 1e-6  # of means of l, relative, and of records: rounded to float32
+LEDGER_TOLERANCE = 1e-3  # relative: a ledger may be kept in few units
+STATISTICS_TOLERANCE = 0.02  # beyond what the cells allow: far more than a tracer errs, far less than matters to render
+LONGEST = 1e30  # [R] of path lengths
+SLAB = 2**20  # pixels that are looked at together: a file of some MB may hold 2^26
 SPHERE_TOLERANCE = 2e-3  # [R^2] float32 loses sqrt(1 - b2) near grazing entry
 
 BLOCKS = ("p_theta", *CONDITIONALS, "mean_l")
@@ -67,7 +76,8 @@ KNOWN = BLOCKS + RECORDS + MEMORY
 AXIS_ENDS = {"p_r": (0.0, 2.0), "p_z": (-1.0, 2.0)}
 
 
-Breach = Callable[[str, str, np.ndarray, str], Broken]  # code, block, where it is broken, what is wrong
+Wrong = Callable[[np.ndarray, slice], np.ndarray]  # of rows of a block, (n, columns) float64, and which they are
+Breach = Callable[[str, str, Wrong, str], Broken]  # code, block, where it is broken, what is wrong
 
 
 def read(path: str | os.PathLike[str]) -> Table:
@@ -126,6 +136,12 @@ def _broken_manifest(header: Mapping[str, Any], width: int, height: int, newer: 
     if ledger["launched"] != parts:
         message = f"launched is {ledger['launched']}, the others sum to {parts}"
         yield "HEADER_LEDGER", "/energy_ledger/launched", message
+    met = ledger["launched"] - ledger["unscattered"]
+    for name, part, whole in (("hit_probability", met, ledger["launched"]), ("albedo", ledger["scattered"], met)):
+        stated = float(header["statistics"][name]) * float(whole)
+        if not abs(stated - float(part)) <= LEDGER_TOLERANCE * stated or part <= 0:
+            message = f"{name} is {header['statistics'][name]:.9g}, but of {whole} units of energy it is {part}"
+            yield "HEADER_STATISTICS", f"/statistics/{name}", message
 
     by_name = {block["name"]: block for block in blocks}
     old = header["format_version"] == "1.0"
@@ -186,79 +202,140 @@ def _broken_edges(place: str, edges: Sequence[float], atoms: tuple[int, ...], wh
             yield "MANIFEST_EDGE_ORDER", f"{place}/{i + 1}", f"the width of {low} to {high} is not {kind}"
 
 
+def _slabs(rows: int, columns: int) -> Iterator[slice]:
+    """Return the rows of a block in parts of at most about `SLAB` pixels."""
+    step = max(1, SLAB // columns)
+    return (slice(first, min(first + step, rows)) for first in range(0, rows, step))
+
+
 def _broken_values(table: Table) -> Broken:
     """Rules of the pixels, (code, place of the first breach, message); not finite ones hide all others."""
     blocks = [block for block in table.header["blocks"] if block["name"] in KNOWN]
     first_row = {block["name"]: block["first_row"] for block in blocks}
 
-    def breach(code: str, name: str, bad: np.ndarray, what: str) -> Broken:
-        if bad.any():
-            row, column = np.argwhere(np.atleast_2d(bad))[0]
-            message = f"{name}: {what}, here first of {int(np.count_nonzero(bad))}"
-            yield code, f"row {first_row[name] + row}, column {column}", message
+    def breach(code: str, name: str, wrong: Wrong, what: str) -> Broken:
+        block, count, place = table.block(name), 0, ""
+        for rows in _slabs(*block.shape):
+            bad = wrong(block[rows].astype(np.float64), rows)
+            if bad.any():
+                row, column = np.argwhere(bad)[0]
+                place = place or f"row {first_row[name] + rows.start + row}, column {column}"
+                count += int(np.count_nonzero(bad))
+        if count:
+            yield code, place, f"{name}: {what}, here first of {count}"
 
-    infinite = [b["name"] for b in blocks if not np.isfinite(table.block(b["name"])).all()]
-    for name in infinite:
-        yield from breach("VALUE_NOT_FINITE", name, ~np.isfinite(table.block(name)), "not finite")
+    infinite = False
+    for name in first_row:
+        for found in breach("VALUE_NOT_FINITE", name, lambda values, _: ~np.isfinite(values), "not finite"):
+            infinite = True
+            yield found
     if infinite:
         return
     for name in BLOCKS:
-        yield from breach("VALUE_NEGATIVE", name, table.block(name) < 0.0, "negative")
+        yield from breach("VALUE_NEGATIVE", name, lambda values, _: values < 0.0, "negative")
     p_theta = table.p_theta
     if abs(p_theta.sum() - 1.0) > SUM_TOLERANCE:
         message = f"p_theta sums to {p_theta.sum():.9g}"
         yield "VALUE_P_THETA_SUM", f"row {first_row['p_theta']}, column 0", message
     empty = p_theta == 0.0
     for name in CONDITIONALS:
-        off = np.abs(table.block(name).sum(axis=0, dtype=np.float64) - 1.0) > SUM_TOLERANCE
-        yield from breach("VALUE_COLUMN_SUM", name, off & ~empty, "the column does not sum to 1")
+        sums = np.zeros(len(p_theta))
+        for row in table.block(name):
+            sums += row
+        off = (np.abs(sums - 1.0) > SUM_TOLERANCE) & ~empty
+
+        def uneven(values: np.ndarray, rows: slice, off: np.ndarray = off) -> np.ndarray:
+            return off & (np.arange(rows.start, rows.stop) == 0)[:, None]
+
+        yield from breach("VALUE_COLUMN_SUM", name, uneven, "the column does not sum to 1")
     for name in (name for name in first_row if name not in MEMORY):
-        filled = (table.block(name) != 0.0) & empty
-        yield from breach("VALUE_EMPTY_COLUMN", name, filled, "not 0 though p_theta is")
+        yield from breach(
+            "VALUE_EMPTY_COLUMN", name, lambda values, _: (values != 0.0) & empty, "not 0 though p_theta is"
+        )
 
-    mean, edges = table.block("mean_l").astype(np.float64), table.edges("p_l")
-    upper = np.append(edges[1:-1], math.inf)  # the last cell holds all longer paths too
-    outside = (mean * (1 + 1e-6) < edges[:-1, None]) | (mean * (1 - 1e-6) > upper[:, None])
-    bad = np.where(table.p_l == 0.0, mean != 0.0, outside)
-    yield from breach("VALUE_MEAN_RANGE", "mean_l", bad, "outside its cell or of no mass")
+    edges = table.edges("p_l")
+    upper = np.append(edges[1:-1], LONGEST)  # the last cell holds all longer paths too
 
+    def outside(values: np.ndarray, rows: slice) -> np.ndarray:
+        low, high = edges[:-1][rows, None], upper[rows, None]
+        strays = (values * (1.0 + ROUNDING) < low) | (values * (1.0 - ROUNDING) > high)
+        return np.where(table.p_l[rows] == 0.0, values != 0.0, strays)
+
+    yield from breach("VALUE_MEAN_RANGE", "mean_l", outside, "outside its cell or of no mass")
     if joint := table.joint:
         atoms = np.zeros(p_theta.shape, dtype=bool)
         atoms[[0, -1]] = True
         yield from _broken_records("joint", joint, atoms, breach)
     if memory := table.memory:
-        hit = table.block("memory_hit")[0]
-        yield from breach("VALUE_MEMORY_HIT", "memory_hit", ~((hit >= 0.0) & (hit <= 1.0)), "not a probability")
+        hit = table.hit
+        yield from breach("VALUE_MEMORY_HIT", "memory_hit", lambda v, _: (v < 0.0) | (v > 1.0), "not a probability")
         yield from _broken_records("memory", memory, np.zeros(hit.shape, dtype=bool), breach)
-        cell, b2 = np.arange(len(hit)) / len(hit), memory["entry_b2"].astype(np.float64)
-        outside = (b2 < cell - CELL_TOLERANCE) | (b2 > cell + 1.0 / len(hit) + CELL_TOLERANCE)
-        yield from breach("VALUE_MEMORY_CELL", "memory_entry_b2", outside & (hit != 0.0), "not of this column's cell")
-        for field, values in memory.items():
-            filled = (values != 0.0) & (hit == 0.0)
-            yield from breach("VALUE_MEMORY_EMPTY", f"memory_{field}", filled, "not 0 though memory_hit is")
+        cell = np.arange(len(hit)) / len(hit)
+        low, high = cell - ROUNDING, cell + 1.0 / len(hit) + ROUNDING
+
+        def strays(values: np.ndarray, _: slice) -> np.ndarray:
+            return ((values < low) | (values > high)) & (hit != 0.0)
+
+        yield from breach("VALUE_MEMORY_CELL", "memory_entry_b2", strays, "not of this column's cell")
+        for field in memory:
+            yield from breach(
+                "VALUE_MEMORY_EMPTY",
+                f"memory_{field}",
+                lambda values, _: (values != 0.0) & (hit == 0.0),
+                "not 0 though memory_hit is",
+            )
+    yield from _broken_statistics(table)
 
 
 def _broken_records(kind: str, records: Mapping[str, np.ndarray], atoms: np.ndarray, breach: Breach) -> Broken:
     """Rules of the records of either kind; `atoms` are the columns in which entry_azimuth must be 0, (columns,)."""
     pi = float(np.float32(math.pi))
     low = {"r": 0.0, "z": -1.0, "phi_delta": -pi, "l": 0.0, "entry_b2": 0.0, "entry_azimuth": -pi, "cos_theta": -1.0}
-    high = {"r": 2.0, "z": 2.0, "phi_delta": pi, "l": math.inf, "entry_b2": 1.0, "entry_azimuth": pi, "cos_theta": 1.0}
-    for field, values in records.items():
-        bad = (values < low[field] - 1e-6) | (values > high[field] + 1e-6)
-        if field == "entry_azimuth":
-            bad |= atoms & (values != 0.0)
-        yield from breach("VALUE_RECORD_RANGE", f"{kind}_{field}", bad, "out of range")
-    falling = np.zeros(records["entry_b2"].shape, dtype=bool)
-    falling[1:] = np.diff(records["entry_b2"], axis=0) < 0.0
+    high = {"r": 2.0, "z": 2.0, "phi_delta": pi, "l": LONGEST, "entry_b2": 1.0, "entry_azimuth": pi, "cos_theta": 1.0}
+    for field in records:
+
+        def outside(values: np.ndarray, _: slice, field: str = field) -> np.ndarray:
+            bad = (values < low[field] - ROUNDING) | (values > high[field] + ROUNDING)
+            return bad | (atoms & (values != 0.0)) if field == "entry_azimuth" else bad
+
+        yield from breach("VALUE_RECORD_RANGE", f"{kind}_{field}", outside, "out of range")
+
+    def falling(values: np.ndarray, rows: slice) -> np.ndarray:
+        before = records["entry_b2"][max(rows.start - 1, 0) : rows.stop - 1]
+        bad = np.zeros(values.shape, dtype=bool)
+        bad[len(values) - len(before) :] = values[len(values) - len(before) :] < before
+        return bad
+
     yield from breach("VALUE_RECORD_ORDER", f"{kind}_entry_b2", falling, "smaller than the one before")
-    r, z, phi_delta, b2, azimuth = (
-        records[field].astype(np.float64) for field in ("r", "z", "phi_delta", "entry_b2", "entry_azimuth")
-    )
-    b2 = np.clip(b2, 0.0, 1.0)
-    # With d_in along z and x_i at azimuth 0, phi_d is entry_azimuth and phi_p is phi_delta + phi_d.
-    across = r**2 + 2.0 * r * np.sqrt(b2) * np.cos(phi_delta + azimuth)
-    off = np.abs(across + z**2 - 2.0 * z * np.sqrt(1.0 - b2)) > SPHERE_TOLERANCE
+
+    def off(r: np.ndarray, rows: slice) -> np.ndarray:
+        z, phi_delta, b2, azimuth = (
+            records[field][rows].astype(np.float64) for field in ("z", "phi_delta", "entry_b2", "entry_azimuth")
+        )
+        b2 = np.clip(b2, 0.0, 1.0)
+        # With d_in along z and x_i at azimuth 0, phi_d is entry_azimuth and phi_p is phi_delta + phi_d.
+        across = r**2 + 2.0 * r * np.sqrt(b2) * np.cos(phi_delta + azimuth)
+        return np.abs(across + z**2 - 2.0 * z * np.sqrt(1.0 - b2)) > SPHERE_TOLERANCE
+
     yield from breach("VALUE_RECORD_SPHERE", f"{kind}_r", off, "the exit is off the bounding sphere")
+
+
+def _broken_statistics(table: Table) -> Broken:
+    """Statistics that the masses of the cells do not allow, whatever lies where in a cell."""
+    p, edges = table.p_theta, table.cos_theta_edges
+    bounds = {"atom_backward": (p[0], p[0]), "atom_forward": (p[-1], p[-1])}
+    bounds["mean_cosine"] = (edges[:-1] @ p, edges[1:] @ p)
+    for name, block in (("mean_r", "p_r"), ("mean_z", "p_z")):
+        edges, share = table.edges(block), np.array([row @ p for row in table.block(block)])
+        bounds[name] = (edges[:-1] @ share, edges[1:] @ share)
+    cells = zip(table.p_l, table.block("mean_l").astype(np.float64), strict=True)
+    length = math.fsum(float((mass * mean) @ p) for mass, mean in cells)
+    bounds["mean_path_length"] = (length, length)
+    for name, (low, high) in bounds.items():
+        slack = STATISTICS_TOLERANCE * (max(1.0, length) if name == "mean_path_length" else 1.0)
+        if not low - slack <= table.statistics[name] <= high + slack:
+            message = f"{name} is {table.statistics[name]:.9g}, the blocks allow {low:.9g} to {high:.9g}"
+            yield "VALUE_STATISTICS", f"/statistics/{name}", message
 
 
 FORMAT = Format(

@@ -11,6 +11,7 @@ from tsdf.compiled import njit
 from tsdf.errors import UsageError
 
 UNPOLARISED, S, P = 0, 1, 2
+ETA = (1e-30, 1e30)  # that a table may have (schema/SPEC.md); 1e9 is a mirror to nine digits
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Optics:
     Parameters
     ----------
     eta : float
-        n_inside / n_outside, finite and > 0; below 1 for a bubble.
+        n_inside / n_outside, in `ETA`; below 1 for a bubble.
     fresnel : {"un", "sp"}
         Reflectance averaged over the polarisations at each hit, or the two kept apart along the whole path.
     material, source : str, optional
@@ -31,7 +32,7 @@ class Optics:
     Raises
     ------
     UsageError
-        If eta is not a finite number above 0 or the convention is unknown.
+        If eta is out of range or the convention is unknown.
     """
 
     eta: float
@@ -42,8 +43,10 @@ class Optics:
     source: str | None = None
 
     def __post_init__(self) -> None:
-        if not (0.0 < self.eta < math.inf):
-            raise UsageError(f"eta must be a finite number above 0 (n_inside / n_outside), got {self.eta}")
+        if not (ETA[0] <= self.eta <= ETA[1]):
+            raise UsageError(
+                f"eta must be a number from {ETA[0]:g} to {ETA[1]:g} (n_inside / n_outside, above 0), got {self.eta}"
+            )
         if self.fresnel not in ("un", "sp"):
             raise UsageError(f"fresnel must be 'un' or 'sp', got {self.fresnel!r}")
 

@@ -54,14 +54,17 @@ class Table:
         The header of the file, see ``schema/header.schema.json``.
     pixels : (rows, columns) float32
         Columns are cells of cos theta in ascending order, rows are stacked blocks as ``header["blocks"]`` lists them.
+        An array that can be written to is copied.
     """
 
     header: Mapping[str, Any]
     pixels: np.ndarray
 
     def __post_init__(self) -> None:
-        pixels = np.array(self.pixels, dtype=np.float32, order="C")
-        pixels.flags.writeable = False
+        pixels = np.asarray(self.pixels, dtype=np.float32, order="C")
+        if pixels.flags.writeable:  # a large file is not held twice
+            pixels = pixels.copy()
+            pixels.flags.writeable = False
         object.__setattr__(self, "pixels", pixels)
         object.__setattr__(self, "header", frozen(self.header))
 
@@ -157,9 +160,11 @@ class Table:
             raise UsageError(f"absorption must be a number >= 0 (sigma_a times the bounding radius), got {absorption}")
         if absorption == 0.0:
             return np.ones(self.pixels.shape[1])
+        share = np.zeros(self.pixels.shape[1])
         with np.errstate(under="ignore"):
-            decay = np.exp(-min(absorption, 1e30) * self.block("mean_l").astype(np.float64))
-        return np.einsum("ij,ij->j", self.p_l.astype(np.float64), decay)
+            for mass, length in zip(self.p_l, self.block("mean_l"), strict=True):  # row by row: blocks may be large
+                share += mass * np.exp(-min(absorption, 1e30) * length.astype(np.float64))
+        return share
 
     def deflection_masses(self, absorption: float = 0.0) -> np.ndarray:
         """Return the deflection distribution of what an absorbing grain lets out, (columns,) float64, sum 1.
@@ -176,12 +181,12 @@ class Table:
         return float(self.statistics["albedo"] * (p @ self.survival(absorption)) / p.sum())
 
     def mean_cosine(self, absorption: float = 0.0) -> float:
-        """Return the energy-weighted mean of cos theta of what an absorbing grain lets out.
+        """Return the energy-weighted mean of cos theta of what an absorbing grain lets out, in [-1, 1].
 
         The lossless value is the header's own, which the cell width does not touch; absorption shifts it by the
         change of the masses between cells. Not a number where nothing is let out.
         """
-        lossless = float(self.statistics["mean_cosine"])
+        lossless = min(max(float(self.statistics["mean_cosine"]), -1.0), 1.0)
         if absorption == 0.0:
             return lossless
         masses = self.deflection_masses(absorption)
@@ -189,4 +194,4 @@ class Table:
             return math.nan
         edges = self.cos_theta_edges
         middle = 0.5 * (edges[1:] + edges[:-1])
-        return float(lossless + middle @ (masses - self.deflection_masses()))
+        return min(max(float(lossless + middle @ (masses - self.deflection_masses())), -1.0), 1.0)
