@@ -54,6 +54,23 @@ def test_atoms_are_marked(tables):
     assert len(axes_of(figure, r"p(z\,").collections) == 3
 
 
+@pytest.mark.parametrize("name", ["cube", "cube_identity", "sphere"])
+def test_the_legend_covers_nothing(tables, name):
+    """It stands clear of the axes and of the labels of atoms, and has a line for each curve."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    figure = plots.plot_validation(tables[name])
+    FigureCanvasAgg(figure).draw()
+    (legend,) = figure.legends
+    box = legend.get_window_extent()
+    texts = [text for axes in figure.axes for text in axes.texts if text.get_text()]
+    assert (len(texts) > 0) == name.startswith("cube")
+    for artist in (*figure.axes, *texts):
+        assert not box.overlaps(artist.get_tightbbox())
+    assert figure.bbox.containsx(box.x0) and figure.bbox.containsx(box.x1) and box.y0 >= 0.0
+    assert len(legend.get_texts()) == len(figure.axes[0].get_legend_handles_labels()[0]) >= 3
+
+
 def test_a_table_that_is_all_atom(tables):
     for draw in (plots.plot_table, plots.plot_validation):
         assert draw(tables["cube_identity"]).axes

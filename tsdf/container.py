@@ -481,10 +481,17 @@ def _validator(name: str) -> Any:
     from jsonschema import Draft202012Validator
     from jsonschema.validators import extend
 
+    def items(validator: Any, rule: Any, values: Any, schema: Mapping[str, Any]) -> Iterator[Any]:
+        if not isinstance(values, list) or len(values) <= schema.get(
+            "maxItems", math.inf
+        ):  # else it is refused, and not looked at for minutes
+            yield from each(validator, rule, values, schema)
+
+    each = Draft202012Validator.VALIDATORS["items"]
     # JSON Schema counts 1.0 as an integer; SPEC.md does not.
     types = Draft202012Validator.TYPE_CHECKER.redefine("integer", lambda _, value: type(value) is int)
     schema = json.loads(resources.files("tsdf.schema").joinpath(name).read_text("ascii"))
-    return extend(Draft202012Validator, type_checker=types)(schema)
+    return extend(Draft202012Validator, {"items": items}, type_checker=types)(schema)
 
 
 def _broken_schema(header: Mapping[str, Any], schema: str, newer: bool) -> Broken:

@@ -116,14 +116,17 @@ def plot_validation(table: Table) -> Any:
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(6.4, 5.4), layout="constrained")
+        figure = Figure(figsize=(6.4, 6.0), layout="constrained")
         figure.suptitle(_title(table), fontsize=10)
         if table.header["grain"]["kind"] == "sphere":
             above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3.2, 1.0))
             _phase_function(above, table)
             _deviation(below, table)
         else:
-            _fits(figure.subplots(), table)
+            above = figure.subplots()
+            _fits(above, table)
+        # below the axes, within which atoms are labelled and a curve may be anywhere
+        figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", frameon=False)
     return figure
 
 
@@ -473,7 +476,6 @@ def _phase_function(axes: Any, table: Table) -> None:
     axes.set_xlim(0.0, 180.0)
     axes.set_xticks(np.arange(0, 181, 20))
     axes.set_ylabel(r"phase function $P(\theta)$")
-    axes.legend(frameon=False, loc="upper right")
 
 
 def _deviation(axes: Any, table: Table) -> None:
@@ -523,4 +525,3 @@ def _fits(axes: Any, table: Table) -> None:
     _atoms(axes, table)
     axes.set_xlabel(r"$\cos\theta$")
     axes.set_ylabel(r"$p_\theta$, density of $\cos\theta$")
-    axes.legend(frameon=False, loc="upper left")
