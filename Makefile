@@ -69,4 +69,10 @@ bench: .venv/installed  ## measure speed and error side by side, into bench/
 	$(BIN)/python benchmarks/bench_sampler.py
 	$(BIN)/python benchmarks/bench_render.py
 
-.PHONY: help install demo tables gallery pictures test check bench
+FUZZERS := tables meshes scenes builds signals
+
+fuzz: .venv/installed  ## throw damaged and hostile files and signals at everything, for minutes; COUNT=1000 SEED=1
+	for name in $(FUZZERS); do \
+		$(BIN)/python fuzz/$$name.py $(if $(COUNT),--count $(COUNT)) --seed $(or $(SEED),0) || exit; done
+
+.PHONY: help install demo tables gallery pictures test check bench fuzz

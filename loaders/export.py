@@ -173,7 +173,7 @@ def bulk(
 
 def _deep_colour(medium: VolumeParameters) -> float:
     """Return the reflectance of a deep layer: the albedo inversion of [1] solved for the reflectance."""
-    if not medium.albedo > 0.0:
+    if not medium.sigma_s_reduced > 0.0:  # nothing comes back
         return 0.0
     s = math.sqrt(max(0.0, 1.0 - medium.albedo) / (1.0 - medium.albedo * medium.g))
     # s = a + b A - sqrt(c + d A + b^2 A^2); squared, what is left is linear in A

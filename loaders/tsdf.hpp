@@ -167,10 +167,12 @@ struct Table {
         return path;
     }
 
-    // Extinction coefficient of point scatterers, 1 / (lambda_beta + albedo lambda_s) [1/unit of the radius].
+    // Extinction coefficient of point scatterers, 1 / (lambda_beta + albedo lambda_s) [1/unit of the radius]; NaN where
+    // that is not positive, which a negative mean_z in a dense packing can do.
     double sigma_t(double f, double radius, double single_scattering_albedo) const noexcept {
         const FreePath path = free_path(f, radius);
-        return 1.0 / (path.lambda_beta + single_scattering_albedo * path.lambda_s);
+        const double way = path.lambda_beta + single_scattering_albedo * path.lambda_s;
+        return way > 0.0 ? 1.0 / way : std::numeric_limits<double>::quiet_NaN();
     }
 
     // The medium of point scatterers that stands for grains of absorption coefficient sigma_a [1/unit of the radius].

@@ -105,7 +105,8 @@ def free_path(components: Sequence[Component], packing_fraction: float) -> FreeP
     Raises
     ------
     UsageError
-        For an empty mixture, fractions that sum to 0 and a packing fraction out of range.
+        For an empty mixture, fractions that sum to 0, a packing fraction out of range, and one at which the mean
+        advance in grains, if negative, outweighs the gaps.
     """
     if not 0.0 < packing_fraction <= MAX_PACKING_FRACTION:
         raise UsageError(
@@ -127,11 +128,18 @@ def free_path(components: Sequence[Component], packing_fraction: float) -> FreeP
     lambda_b = 4.0 * (1.0 - packing_fraction) / (3.0 * packing_fraction) * mean_radius
     chords = [c.table.statistics["mean_miss_chord"] * c.radius for c in components]
     lambda_delta = _mean(misses, chords) if missed > 0.0 else 0.0
+    lambda_beta = lambda_b + (lambda_b + lambda_delta) * missed / met
+    lambda_s = _mean(hits, _advances(components))
+    if not lambda_beta + lambda_s > 0.0:
+        raise UsageError(
+            f"at a packing fraction of {packing_fraction:g} light would go back farther in grains (mean z "
+            f"{lambda_s:.3g}) than on between them ({lambda_beta:.3g}): take a lower one, or build the table again"
+        )
     return FreePath(
         lambda_b=lambda_b,
         lambda_delta=lambda_delta,
-        lambda_beta=lambda_b + (lambda_b + lambda_delta) * missed / met,
-        lambda_s=_mean(hits, _advances(components)),
+        lambda_beta=lambda_beta,
+        lambda_s=lambda_s,
         hit_probability=met / math.fsum(spheres),
         choice=tuple(h / met for h in hits),
     )

@@ -21,6 +21,7 @@ from tsdf.validate import ROUNDING, ZHOU_ETA, reference
 SUFFIXES = (".png", ".pdf")
 DPI = 160
 DECADES = 3.0  # range of the colours below the largest density
+DENSEST = 1e30  # density shown; cells may be as narrow as numbers are
 SHOWN = 0.999  # share of the light whose path lengths are in the picture
 STRIP = (0.05, 0.10)  # distance from the axis and width of an atom's strip [cos theta]
 STYLE: Any = {
@@ -403,7 +404,8 @@ def _conditional(figure: Any, axes: Any, table: Table, name: str, label: str, ti
         share = np.cumsum(masses @ table.p_theta)
         last = int(np.searchsorted(share, SHOWN * share[-1])) + 1
         rows, masses = rows[1 : last + 1], masses[1:last]
-    density = masses / np.diff(rows)[:, None]
+    with np.errstate(over="ignore"):
+        density = np.minimum(masses / np.diff(rows)[:, None], DENSEST)
     # log colours from the most of what matters: a few cells at a rainbow do not set the scale
     light = density[:, table.p_theta > 0.0]
     top = float(np.quantile(light[light > 0.0], 0.995)) if (light > 0.0).any() else 1.0

@@ -55,6 +55,7 @@ from tsdf.walker import (
 )  # fmt: skip
 
 DARKEST = 1e-300  # albedo, so that it has a logarithm
+FARTHEST = 1e300  # free path where nothing deflects, finite so that 0 of it is 0
 LOOKS = 200  # pixels along each side through which it is looked whether the camera sees anything
 LONGEST_OFFSET = math.sqrt(8.0)  # [R] r and z drawn independently: at most 2 each
 
@@ -306,9 +307,10 @@ def _media(scene: Scene, model: int, tables: list[Table]) -> tuple[Media, Absorp
         first.append(at)
         kinds.append(len(components))
         choice += list(np.cumsum(path.choice))
-        g += [volume.g] * len(components)
+        mean_cosine = volume.g if volume.albedo > 0.0 else 0.0  # where no light leaves a grain any will do
+        g += [mean_cosine] * len(components)
         if model == ISOTROPIC:
-            free.append(1.0 / (volume.sigma_t * (1.0 - volume.g)))
+            free.append(1.0 / max(volume.sigma_t * (1.0 - mean_cosine), 1.0 / FARTHEST))
         else:
             free.append(
                 path.lambda_beta
@@ -332,8 +334,8 @@ def _media(scene: Scene, model: int, tables: list[Table]) -> tuple[Media, Absorp
                 ]
                 slots.append(amount(np.log(kept[0]) if by_wavelength is not None else None, np.log(kept[1])))
                 if by_wavelength is not None:
-                    flown_wavelength -= probability * volume.sigma_t * volume.g * (1.0 - kept[0])
-                flown_channel -= probability * volume.sigma_t * volume.g * (1.0 - kept[1])
+                    flown_wavelength -= probability * volume.sigma_t * mean_cosine * (1.0 - kept[0])
+                flown_channel -= probability * volume.sigma_t * mean_cosine * (1.0 - kept[1])
             else:
                 slots.append(amount(None if by_wavelength is None else -by_wavelength, -by_channel))
         absorbing = any(absorbs[i] for i in these)
