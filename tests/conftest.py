@@ -1,6 +1,10 @@
-"""Tests keep their packings to themselves: no test reads or writes the user's cache."""
+"""Tests keep their packings to themselves: no test reads or writes the user's cache. The scripts of fuzz/ by name."""
 
+import importlib.util
+import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -11,3 +15,17 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     patch = pytest.MonkeyPatch()
     patch.setenv("TSDF_CACHE", str(folder))
     return folder
+
+
+@pytest.fixture(scope="session")
+def fuzzer() -> Callable[[str], ModuleType]:
+    """Return the script of fuzz/ that has a name, as a module."""
+
+    def load(name: str) -> ModuleType:
+        spec = importlib.util.spec_from_file_location(f"fuzz_{name}", Path(__file__).parents[1] / "fuzz" / f"{name}.py")
+        assert spec is not None and spec.loader is not None
+        module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+    return load
