@@ -1218,7 +1218,7 @@ class Reader {
         if (!whole) return fail("MANIFEST_EDGE_ENDS", "this is not the range of this axis", place);
         for (std::size_t i = 0; i + 1 < edges.size(); ++i) {
             const bool none = (atom && i == 0) || (last_atom && i + 2 == edges.size());
-            if (none ? edges[i] != edges[i + 1] : !(edges[i] < edges[i + 1]))
+            if (none ? edges[i] != edges[i + 1] : !(edges[i + 1] - edges[i] >= 1e-30))
                 return fail("MANIFEST_EDGE_ORDER", none ? "the width of this cell is not zero" : "edges do not ascend",
                             place + "/" + std::to_string(i + 1));
         }

@@ -540,6 +540,7 @@ def invalid() -> dict[str, bytes]:
     edit("MANIFEST_RECORDS-length", at("rows", 7, "blocks", -1), joint, joint_pixels[:-1])
     edit("MANIFEST_EDGE_COUNT", at("edges", [0.0, 2.0], "blocks", 2))
     edit("MANIFEST_EDGE_ORDER-falling", at("edges", [-1.0, 2.5, 2.0], "blocks", 3))
+    edit("MANIFEST_EDGE_ORDER-narrow", at("edges", [0.0, 1e-31, 2.0], "blocks", 2))
     edit("MANIFEST_EDGE_ORDER-no_atom", at("edges", [-1.0, -0.5, 0.0, 1.0, 1.0], "columns"))
     edit("MANIFEST_EDGE_ORDER-atom_in_r", at("edges", [0.0, 0.0, 2.0], "blocks", 2))
     edit("MANIFEST_EDGE_ENDS-columns", at("edges", [-0.5, -0.5, 0.0, 1.0, 1.0], "columns"))

@@ -63,8 +63,8 @@ def far(header: dict[str, Any], pixels: np.ndarray) -> None:
 
 
 def narrow(header: dict[str, Any], pixels: np.ndarray) -> None:
-    """Cells as narrow as numbers are."""
-    next(block for block in header["blocks"] if block["name"] == "p_r")["edges"][1] = 5e-324
+    """Cells as narrow as they may be."""
+    next(block for block in header["blocks"] if block["name"] == "p_r")["edges"][1] = 1e-30
     block = rows(header, "p_r")
     pixels[block] = 0.0
     pixels[block.start] = 1.0

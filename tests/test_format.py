@@ -7,6 +7,7 @@ import re
 import struct
 import subprocess
 import sys
+import time
 import tracemalloc
 import zlib
 from functools import cache
@@ -540,6 +541,41 @@ def test_a_long_hostile_header_takes_bounded_time() -> None:
             "HEADER_DEPTH",
             "HEADER_SCHEMA",
         }
+
+
+def test_the_largest_lists_take_bounded_time() -> None:
+    """Of lists that are too long it is said so, and no entry is looked at: 28,000 blocks took a minute of processor."""
+    header, pixels = make_golden.table(make_golden.WEIGHTS)
+    for key, value in (
+        ("blocks", [{"name": "a", "first_row": 0, "rows": 1}] * 28_000),
+        ("required_features", [""] * 65),
+    ):
+        start = time.process_time()
+        found = codes(make_golden.file({**header, key: value}, pixels))
+        assert found == (["HEADER_SCHEMA"] if key == "blocks" else ["VERSION_FEATURE"])
+        assert time.process_time() - start < 3.0
+
+
+def test_memory_of_a_large_image_is_bounded() -> None:
+    """A sound file of 60 kB with an image of 16 MB: read in less than three times that, and not held twice."""
+    header, pixels = make_golden.table([0] * 1023 + [1], count=2, joint=True)
+    rows, parts, count = 0, [], 670
+    for block in header["blocks"]:
+        own = pixels[block["first_row"] : block["first_row"] + block["rows"]]
+        own = np.repeat(own[:1], count, axis=0) if block["name"].startswith("joint_") else own
+        block["first_row"], block["rows"] = rows, len(own)
+        rows += len(own)
+        parts.append(own)
+    data = make_golden.file(header, np.concatenate(parts))
+    assert len(data) < 2e5 and rows * 1024 * 4 > 16e6
+    tracemalloc.start()
+    try:
+        table, findings = fmt.inspect(data)
+        held, most = tracemalloc.get_traced_memory()
+        assert table is not None and not findings
+        assert held < 1.3 * table.pixels.nbytes and most < 3.0 * table.pixels.nbytes
+    finally:
+        tracemalloc.stop()
 
 
 # --- other files -------------------------------------------------------------------

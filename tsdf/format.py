@@ -39,7 +39,7 @@ CODES = container.rules("tsdf", "tsdf", "header.schema.json") | {
     "MANIFEST_WIDTH": ("error", "the image has as many columns as there are cells of cos theta"),
     "MANIFEST_EDGE_COUNT": ("error", "a block of masses has one edge more than rows"),
     "MANIFEST_EDGE_ENDS": ("error", "the edges of an axis span its whole range"),
-    "MANIFEST_EDGE_ORDER": ("error", "edges ascend; exactly the cells that are atoms have zero width"),
+    "MANIFEST_EDGE_ORDER": ("error", "edges ascend by 1e-30 or more, but by 0 in the cells that are atoms"),
     "VALUE_NOT_FINITE": ("error", "every pixel of a known block is finite"),
     "VALUE_NEGATIVE": ("error", "masses and means are not negative"),
     "VALUE_P_THETA_SUM": ("error", "p_theta sums to 1 within 1e-5"),
@@ -66,7 +66,8 @@ ROUNDING = 1e-6  # of means of l, relative, and of records: rounded to float32
 LEDGER_TOLERANCE = 1e-3  # relative: a ledger may be kept in few units
 STATISTICS_TOLERANCE = 0.02  # beyond what the cells allow: far more than a tracer errs, far less than matters to render
 LONGEST = 1e30  # [R] of path lengths
-SLAB = 2**20  # pixels that are looked at together: a file of some MB may hold 2^26
+NARROWEST = 1e-30  # width of a cell, so that densities are finite even where subnormal numbers are taken for 0
+SLAB = 2**18  # pixels that are looked at together: a file of some MB may hold 2^26
 SPHERE_TOLERANCE = 2e-3  # [R^2] float32 loses sqrt(1 - b2) near grazing entry
 
 BLOCKS = ("p_theta", *CONDITIONALS, "mean_l")
@@ -197,8 +198,8 @@ def _broken_edges(place: str, edges: Sequence[float], atoms: tuple[int, ...], wh
     if not whole:
         yield "MANIFEST_EDGE_ENDS", place, f"{edges[0]} to {edges[-1]} is not the range of this axis"
     for i, (low, high) in enumerate(pairwise(edges)):
-        if (low != high) if i in atoms else not (low < high):
-            kind = "zero" if i in atoms else "positive"
+        if (low != high) if i in atoms else not (high - low >= NARROWEST):
+            kind = "zero" if i in atoms else f"{NARROWEST:g} or more"
             yield "MANIFEST_EDGE_ORDER", f"{place}/{i + 1}", f"the width of {low} to {high} is not {kind}"
 
 
@@ -206,6 +207,11 @@ def _slabs(rows: int, columns: int) -> Iterator[slice]:
     """Return the rows of a block in parts of at most about `SLAB` pixels."""
     step = max(1, SLAB // columns)
     return (slice(first, min(first + step, rows)) for first in range(0, rows, step))
+
+
+def _nothing(pixels: np.ndarray) -> np.ndarray:
+    """Return which float32 are 0 by their bits: renderers tell their processor to take subnormal numbers for 0 too."""
+    return (pixels.view(np.uint32) << 1) == 0
 
 
 def _broken_values(table: Table) -> Broken:
@@ -237,7 +243,7 @@ def _broken_values(table: Table) -> Broken:
     if abs(p_theta.sum() - 1.0) > SUM_TOLERANCE:
         message = f"p_theta sums to {p_theta.sum():.9g}"
         yield "VALUE_P_THETA_SUM", f"row {first_row['p_theta']}, column 0", message
-    empty = p_theta == 0.0
+    empty = _nothing(table.block("p_theta")[0])
     for name in CONDITIONALS:
         sums = np.zeros(len(p_theta))
         for row in table.block(name):
@@ -259,7 +265,7 @@ def _broken_values(table: Table) -> Broken:
     def outside(values: np.ndarray, rows: slice) -> np.ndarray:
         low, high = edges[:-1][rows, None], upper[rows, None]
         strays = (values * (1.0 + ROUNDING) < low) | (values * (1.0 - ROUNDING) > high)
-        return np.where(table.p_l[rows] == 0.0, values != 0.0, strays)
+        return np.where(_nothing(table.p_l[rows]), values != 0.0, strays)
 
     yield from breach("VALUE_MEAN_RANGE", "mean_l", outside, "outside its cell or of no mass")
     if joint := table.joint:
