@@ -479,17 +479,18 @@ def _records(gavel: _Judge, t: _Subject) -> None:
         values = joint[name].astype(np.float64)
         if block == "p_phi":
             values = np.where(values < edges[0], values + 2.0 * math.pi, values)
-        cell = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(masses) - 1)
+        cell = np.searchsorted(edges, values, side="right").astype(np.int32) - 1  # there may be many
+        np.clip(cell, 0, len(masses) - 1, out=cell)
         if block == "p_l":
-            cell = np.where(values <= 0.0, 0, np.maximum(cell, 1))
+            cell = np.where(values <= 0.0, np.int32(0), np.maximum(cell, 1))
         pointer = f"/blocks/{place[f'joint_{name}']}"
         about = np.pad(masses, ((1, 1), (0, 0)), mode="wrap" if block == "p_phi" else "constant")
         about = about[2:] + about[1:-1] + about[:-2]  # float32 may round a record over an edge
-        outside = int(np.count_nonzero((about[cell, columns] == 0.0) & drawn))
+        outside = int(np.count_nonzero((about == 0.0)[cell, columns] & drawn))
         text = f"{outside} of {values[:, drawn].size} values of joint_{name} lie where {block} is 0, 0 allowed"
         gavel.require(outside == 0, "STATISTICS_RECORD_SUPPORT", pointer, text)
 
-        rank = (np.cumsum(masses, axis=0) - 0.5 * masses)[cell, columns] - 0.5
+        rank = (np.cumsum(masses, axis=0) - 0.5 * masses - 0.5)[cell, columns]
         variance = (1.0 - (masses**3).sum(axis=0)) / 12.0
         variance = np.where(drawn, variance, 0.0)
         total = float(variance.sum())
@@ -502,6 +503,7 @@ def _records(gavel: _Judge, t: _Subject) -> None:
         text = f"mean square deviation of joint_{name} from {block} [that of unrelated draws]"
         gavel.within("STATISTICS_RECORDS", pointer, text, mean, 0.0, limit)
 
+    del values, cell  # large
     # (x_o - x_i) . d_in and, of the reversed path, (x_o - x_i) . d_out have the same mean at each theta
     theta = np.arccos(t.edges)
     sines = np.sin(0.5 * (theta[:-1] + theta[1:]))
