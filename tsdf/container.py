@@ -482,9 +482,8 @@ def _validator(name: str) -> Any:
     from jsonschema.validators import extend
 
     def items(validator: Any, rule: Any, values: Any, schema: Mapping[str, Any]) -> Iterator[Any]:
-        if not isinstance(values, list) or len(values) <= schema.get(
-            "maxItems", math.inf
-        ):  # else it is refused, and not looked at for minutes
+        # a list that is too long is refused as such, and not looked at for minutes
+        if not isinstance(values, list) or len(values) <= schema.get("maxItems", math.inf):
             yield from each(validator, rule, values, schema)
 
     each = Draft202012Validator.VALIDATORS["items"]
