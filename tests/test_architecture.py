@@ -34,6 +34,10 @@ LAYERS = [
         "image",
         "lights",
         "medium",
+        "polygons",
+        "gltf",
+        "vtk",
+        "meshes",
         "packing",
         "room",
     },
@@ -49,7 +53,9 @@ LAYERS = [
 ]
 DOORS = {
     "numba": {"compiled"},
-    "trimesh": {"grains"},
+    "DracoPy": {"gltf"},
+    "collada": {"meshes"},
+    "mapbox_earcut": {"polygons"},
     "embreex": {"grains"},
     "OpenEXR": {"container", "image"},
     "colour": {"image"},

@@ -16,7 +16,8 @@ import numpy as np
 from tsdf.compiled import njit
 from tsdf.errors import SceneError, TSDFError
 from tsdf.geometry import planes_of
-from tsdf.grains import Grain, embree_scene, grain_from_mesh, load_grain, read_mesh
+from tsdf.grains import Grain, embree_scene, grain_from_mesh, load_grain
+from tsdf.meshes import read_mesh
 from tsdf.optics import UNPOLARISED, P, S, fresnel
 from tsdf.packing import Cells, cells_of, next_sphere, pack
 from tsdf.room import stands

@@ -17,7 +17,8 @@ import numpy as np
 
 from tsdf.compiled import njit
 from tsdf.errors import GrainError, SceneError
-from tsdf.grains import first_hit, grain_from_mesh, read_mesh, triangle_scene
+from tsdf.grains import first_hit, grain_from_mesh, triangle_scene
+from tsdf.meshes import read_mesh
 from tsdf.room import BALL, BOX, CLOSED, MESH, OPEN, SLAB, Room, exact_depth, room_of
 from tsdf.scene import Box, MediumSpec, Mesh, Rectangle, Scene, Slab, Sphere, SurfaceSpec
 from tsdf.vectors import KERNEL, dot, step

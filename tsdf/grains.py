@@ -1,14 +1,13 @@
 """Grains: a file or the name of an exemplar becomes a clean closed triangle mesh, or a one-line error.
 
-The only door to trimesh (file formats) and embreex (ray casting); both are imported inside functions. What a
-grain is made of is `optics`, how it scatters is `tracer`, the built-in shapes are `exemplars`.
+The only door to embreex (ray casting), imported inside functions. Which files are read is `meshes`; what a grain is
+made of is `optics`, how it scatters is `tracer`, the built-in shapes are `exemplars`.
 Convention: lengths in units of R, the radius of the minimal bounding sphere, whose centre is the origin;
 facets are wound so that their geometric normal points from the material to the void, in cavities too.
 """
 
 import hashlib
-import logging
-import warnings
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tsdf.errors import GrainError, UsageError
 from tsdf.exemplars import EXEMPLARS
+from tsdf.meshes import read_mesh
 from tsdf.surface import (
     MODELLER,
     Floats,
@@ -115,8 +115,8 @@ def load_grain(source: str | Path, repair: bool = False, **parameters: Any) -> G
     Parameters
     ----------
     source : str or Path
-        ``"sphere"``, the name of an exemplar, or a mesh file (OBJ, PLY, STL, OFF, GLB and whatever else
-        trimesh reads). A name wins over a file of that name; write ``./cube`` for the file.
+        ``"sphere"``, the name of an exemplar, or a mesh file (`tsdf.meshes.READERS`). A
+        name wins over a file of that name; write ``./cube`` for the file.
     repair : bool
         Close holes before judging; see `grain_from_mesh`.
     **parameters
@@ -141,68 +141,10 @@ def load_grain(source: str | Path, repair: bool = False, **parameters: Any) -> G
         nothing, none = np.empty((0, 3)), np.empty((0, 3), np.int32)
         area, volume = 4 * np.pi, 4 * np.pi / 3
         return Grain("sphere", name, {}, nothing, none, 1.0, area, volume, True, 1, (), digest)
+    if not os.path.exists(name.replace("\0", "")):
+        raise GrainError(f"{name}: neither a file nor a built-in grain; built-in grains are {', '.join(BUILT_INS)}")
     vertices, faces = read_mesh(Path(source))
     return grain_from_mesh(vertices, faces, name=Path(source).name, repair=repair)
-
-
-def read_mesh(path: Path) -> tuple[NDArray, NDArray]:
-    """Return all triangles of a mesh file, placed as its scene places them, with nothing merged or checked.
-
-    Returns
-    -------
-    vertices : (n, 3) float
-    faces : (m, 3) int
-
-    Raises
-    ------
-    GrainError
-        The file does not exist, cannot be read or holds no faces.
-    """
-    try:
-        if not path.exists():
-            built_ins = ", ".join(BUILT_INS)
-            raise GrainError(f"{path}: neither a file nor a built-in grain; built-in grains are {built_ins}")
-        if path.is_dir():
-            raise GrainError(f"{path}: is a directory; name a mesh file in it")
-        if path.stat().st_size == 0:
-            raise GrainError(f"{path}: is empty; export the mesh again")
-        geometries = _trimesh_geometries(path)
-    except GrainError:
-        raise
-    except ImportError:  # of charset_normalizer, lxml, ...: trimesh's optional modules, or a damaged text file
-        reason = "damaged, or of a kind this installation cannot read"
-        raise GrainError(f"{path}: {reason}; export it as OBJ, PLY, STL or GLB") from None
-    except Exception as error:  # trimesh's loaders raise whatever their parsing runs into
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
-        way_out = "export it as OBJ, PLY, STL or GLB"
-        raise GrainError(f"{path}: cannot be read as a mesh ({reason}); {way_out}") from None
-    meshes = [(np.asarray(g.vertices), np.asarray(g.faces)) for g in geometries if len(getattr(g, "faces", ()))]
-    if not meshes:
-        what = "points or lines but no faces" if geometries else "no mesh"
-        raise GrainError(f"{path}: holds {what}; a grain is a closed triangle mesh")
-    starts = np.cumsum([0] + [len(v) for v, _ in meshes[:-1]])
-    return np.vstack([v for v, _ in meshes]), np.vstack([f + s for (_, f), s in zip(meshes, starts, strict=True)])
-
-
-def _trimesh_geometries(path: Path) -> list:
-    """Return trimesh's geometries of a file, their scene's transforms applied, without a word of its own."""
-    import trimesh
-
-    kind = path.suffix[1:].lower()
-    log = logging.getLogger("trimesh")
-    silenced, log.disabled = log.disabled, True
-    try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            if kind in ("obj", "off"):  # text whose comments may be in any encoding; materials are not needed
-                with path.open(encoding="utf-8", errors="replace") as text:
-                    scene = trimesh.load_scene(text, file_type=kind, process=False)
-            else:
-                # process=False: trimesh would merge vertices within 1e-8, wrong for grains of size 1e-6
-                scene = trimesh.load_scene(str(path), process=False)
-            return list(scene.dump())
-    finally:
-        log.disabled = silenced
 
 
 # ------------------------------------------------------------------------------------- from mesh to grain

@@ -7,6 +7,7 @@ import numpy as np
 from tsdf.compiled import njit
 from tsdf.vectors import cross, dot, step, triple
 
+LEAF = 8  # points in the smallest box of the search for what stands before a plane
 UNKNOWN = 2.0  # horizon of a facet of which nothing is promised: no sine exceeds it
 
 
@@ -63,6 +64,62 @@ def _rise(obstructed, faces, corners, normals, centroids, radii, corner_sines, h
         horizon[i] = min(top, 1.0)
 
 
+def _boxes(points):
+    """Return points (n, 3) in an order that keeps neighbours together, and boxes (2 k, 2, 3) around `LEAF` at a time.
+
+    A binary tree: box 1 holds all points, box i holds boxes 2 i and 2 i + 1, and the last k boxes hold points.
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    cell = ((points - low) / np.maximum(high - low, 1e-300) * 1023.0).astype(np.int64)
+    key = np.zeros(len(points), np.int64)
+    for bit in range(10):  # Morton's order
+        for axis in range(3):
+            key |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
+    ordered = points[np.argsort(key, kind="stable")]
+    leaves = 1 << max(0, math.ceil(math.log2(len(points) / LEAF)))
+    filled = np.resize(ordered, (leaves * LEAF, 3))
+    filled[len(points) :] = ordered[-1]
+    boxes = np.empty((2 * leaves, 2, 3))
+    blocks = filled.reshape(leaves, LEAF, 3)
+    boxes[leaves:, 0], boxes[leaves:, 1] = blocks.min(axis=1), blocks.max(axis=1)
+    while leaves > 1:
+        pairs = boxes[leaves : 2 * leaves].reshape(leaves // 2, 2, 2, 3)
+        leaves //= 2
+        boxes[leaves : 2 * leaves, 0], boxes[leaves : 2 * leaves, 1] = (
+            pairs[:, :, 0].min(axis=1),
+            pairs[:, :, 1].max(axis=1),
+        )
+    return filled, boxes
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _obstruct(planes, points, boxes, horizon):
+    """Write 0 into `horizon` where no point lies before a facet's plane; boxes behind the plane are passed over."""
+    leaves = len(boxes) // 2
+    waiting = np.empty(128, np.int64)
+    for i in range(len(planes)):
+        n, level = (planes[i, 0], planes[i, 1], planes[i, 2]), planes[i, 3] + 1e-9
+        waiting[0], count, before = 1, 1, False
+        while count > 0 and not before:
+            count -= 1
+            box = waiting[count]
+            reach = 0.0
+            for axis in range(3):
+                reach += n[axis] * boxes[box, 1 if n[axis] > 0.0 else 0, axis]
+            if reach <= level:
+                continue
+            if box < leaves:
+                waiting[count], waiting[count + 1] = 2 * box, 2 * box + 1
+                count += 2
+                continue
+            for k in range((box - leaves) * LEAF, (box - leaves + 1) * LEAF):
+                if dot(n, triple(points[k])) > level:
+                    before = True
+                    break
+        if not before:
+            horizon[i] = 0.0
+
+
 def horizon_of(vertices: np.ndarray, faces: np.ndarray, planes: np.ndarray) -> np.ndarray:
     """Return for each facet the sine of an elevation above which nothing of the grain stands, (facets,) float64.
 
@@ -70,13 +127,8 @@ def horizon_of(vertices: np.ndarray, faces: np.ndarray, planes: np.ndarray) -> n
     the whole grain lies behind the facet's plane (every facet of a convex grain); UNKNOWN where nothing is promised,
     as for all facets with something before them if there are so many that looking would take longer than tracing.
     """
-    from scipy.spatial import ConvexHull
-
-    hull = vertices[ConvexHull(vertices).vertices]
     horizon = np.ones(len(planes))
-    for start in range(0, len(planes), 1024):
-        part = planes[start : start + 1024]
-        horizon[start : start + 1024][(part[:, :3] @ hull.T).max(axis=1) <= part[:, 3] + 1e-9] = 0.0
+    _obstruct(planes, *_boxes(vertices), horizon)
     obstructed = np.flatnonzero(horizon)
     if 0 < len(obstructed) * len(planes) <= 1e9:
         corners = vertices[faces]
