@@ -137,6 +137,7 @@ def told(progress: "Progress", target: float | None) -> Callable[["Done"], None]
     "--threads", callback=_count, metavar="N", help="Threads; the result does not depend on it.  [default: all]"
 )
 @click.option("--repair", is_flag=True, help="Try to close an open mesh, and say what that changed.")
+@click.option("--repair-any", is_flag=True, help="As --repair, even if more than a tenth of the surface is new.")
 @click.option("--chunk", "part", callback=_part, metavar="i/n", help="Trace part i of n only; --out is for tsdf-merge.")
 @click.option("--resume", is_flag=True, help="Go on with an interrupted build of the same command.")
 @click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
@@ -166,6 +167,7 @@ def main(
     max_bounces: int,
     threads: int | None,
     repair: bool,
+    repair_any: bool,
     part: tuple[int, int] | None,
     resume: bool,
     quiet: bool,
@@ -183,7 +185,7 @@ def main(
         raise UsageError("the exact sphere takes no paths, chunks or resuming; add --traced to trace it")
     if part is not None and target_error is not None:
         raise UsageError("parts cannot know when the whole meets a target: give --paths with --chunk")
-    if repair and grain == "sphere":
+    if (repair or repair_any) and grain == "sphere":
         raise UsageError("--repair is for mesh files")
 
     from tsdf import scatterometer
@@ -209,7 +211,7 @@ def main(
     from tsdf.format import write
     from tsdf.grains import load_grain
 
-    shape = load_grain(grain, repair=repair, **settings)
+    shape = load_grain(grain, repair="any" if repair_any else repair, **settings)
     if not quiet:
         for note in shape.notes:
             click.echo(f"note: {note}", err=True)

@@ -11,7 +11,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,17 +29,24 @@ from tsdf.surface import (
     compact,
     equal_vertices,
     filled,
+    grid_step,
+    grid_tilt,
     half_edges,
     is_convex,
     mesh_hash,
     oriented,
     outward,
+    parted,
     with_volume,
     without_slivers,
 )
 
 BUILT_INS = ("sphere", *EXEMPLARS)
 
+MOST_TILT = (
+    0.01  # [rad] of facets by rounding; icospheres of ice: 0.015 moves g by -0.0009, 0.038 by -0.005, 0.15 by -0.046
+)
+MOST_REPAIRED = 0.1  # share of the surface that closing holes may make without being asked
 RAY_OFFSET = 1e-5  # [R] restart distance off a facet along its normal: 1e-7 to 1e-4 leave no self-hits
 LARGEST_COORDINATE = 1e100  # squares and products of coordinates must stay finite in float64
 
@@ -98,18 +105,20 @@ class Crossings(NamedTuple):
     """What straight test rays met.
 
     ``share`` of them entered or left the material twice in a row, confirmed by shifted rays; ``leaks`` is the
-    share that did so only once, grazing an edge; ``place`` (3,) float64 [R] is one confirmed point or zeros.
+    share that did so only once, grazing an edge; ``place`` (3,) float64 [R] is one confirmed point or zeros;
+    ``touching`` tells that void closer than `RAY_OFFSET` lies between facets there: bodies touch.
     """
 
     share: float
     leaks: float
     place: Floats
+    touching: bool = False
 
 
 # ---------------------------------------------------------------------------------------------- loading
 
 
-def load_grain(source: str | Path, repair: bool = False, **parameters: Any) -> Grain:
+def load_grain(source: str | Path, repair: bool | Literal["any"] = False, **parameters: Any) -> Grain:
     """Return the grain named or stored in `source`.
 
     Parameters
@@ -117,7 +126,7 @@ def load_grain(source: str | Path, repair: bool = False, **parameters: Any) -> G
     source : str or Path
         ``"sphere"``, the name of an exemplar, or a mesh file (`tsdf.meshes.READERS`). A
         name wins over a file of that name; write ``./cube`` for the file.
-    repair : bool
+    repair : bool or "any"
         Close holes before judging; see `grain_from_mesh`.
     **parameters
         Parameters of the exemplar (`tsdf.exemplars.EXEMPLARS`); none for files and the sphere.
@@ -154,7 +163,7 @@ def grain_from_mesh(
     vertices: ArrayLike,
     faces: ArrayLike,
     name: str = "mesh",
-    repair: bool = False,
+    repair: bool | Literal["any"] = False,
     kind: str = "mesh",
     parameters: Mapping[str, float | int] | None = None,
 ) -> Grain:
@@ -172,8 +181,9 @@ def grain_from_mesh(
         Vertex indices.
     name : str
         What errors and the grain are called.
-    repair : bool
-        Close holes by a triangle, or by a fan about the centroid of the rim, and drop shells without volume.
+    repair : bool or "any"
+        Close holes by a triangle, or by a fan about the centroid of the rim, and drop shells without volume; refused
+        if that would make more than a tenth of the surface, unless "any".
     kind : str
         Recorded as given.
     parameters : mapping, optional
@@ -188,6 +198,7 @@ def grain_from_mesh(
     points, triangles = _checked_arrays(vertices, faces, name)
     notes: list[str] = []
     points, triangles = compact(points, triangles)
+    step = grid_step(points)
     low, high = points.min(axis=0), points.max(axis=0)
     centre, scale = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     if not scale > 0:
@@ -201,12 +212,8 @@ def grain_from_mesh(
     points, triangles = compact(points, equal_vertices(points)[triangles])
     points, triangles = closed_faces(points, triangles, notes)
 
+    points, triangles = parted(points, triangles, name, place, notes)
     half, edge, uses = half_edges(triangles)
-    if (uses > 2).any():
-        worst = half[np.flatnonzero(uses[edge] > 2)[0]]
-        fault = f"{(uses > 2).sum()} edges are shared by more than two faces, one at "
-        way_out = f"remove inner walls and doubled parts: {MODELLER}"
-        raise GrainError(f"{name}: {fault}{place(points[worst].mean(axis=0))}; {way_out}")
     triangles, shell = oriented(triangles, name, notes)
     open_edges = int((uses == 1).sum())
     if open_edges:
@@ -214,20 +221,31 @@ def grain_from_mesh(
             where = place(points[half[np.flatnonzero(uses[edge] == 1)[0]]].mean(axis=0))
             way_out = "close the holes or pass --repair"
             raise GrainError(f"{name}: not closed: {open_edges} boundary edges, one at {where}; {way_out}")
-        points, triangles = filled(points, triangles, notes)
-    triangles = without_slivers(points, triangles, notes)
-    half, edge, uses = half_edges(triangles)
+        points, triangles, share = filled(points, triangles, notes)
+        if share > MOST_REPAIRED and repair != "any":
+            fault = f"closing its holes would make {100 * share:.2g} % of the surface, more than a tenth"
+            raise GrainError(f"{name}: {fault}; complete the mesh, or pass --repair-any to close them all the same")
+    even = without_slivers(points, triangles, notes)
+    changed = open_edges > 0 or even is not triangles
+    triangles = even
+    if changed:
+        half, edge, uses = half_edges(triangles)
     if len(triangles) == 0 or (uses != 2).any():
         raise GrainError(f"{name}: {(uses != 2).sum()} edges cannot be closed; {MODELLER}")
-
-    triangles, shell = oriented(triangles, name, notes)
-    triangles, shell = with_volume(points, triangles, shell, name, repair, notes)
+    if changed:
+        triangles, shell = oriented(triangles, name, notes)
+    triangles, shell = with_volume(points, triangles, shell, name, bool(repair), notes)
     triangles, bodies = outward(points, triangles, shell, name, place, notes)
 
     points, triangles = compact(points, triangles)
     middle, radius = bounding_sphere(points)
     points = (points - middle) / radius
     centre, scale = centre + scale * middle, scale * radius
+    tilt = grid_tilt(points, triangles, step / scale)
+    if tilt > MOST_TILT:
+        fault = f"coordinates stand on a grid of {100 * step / scale:.2g} % of R ({step:.2g} in the file)"
+        effect = f"its facets are tilted by about {np.degrees(tilt):.2g} degrees, as if rough"
+        notes.append(f"{fault}: {effect}; export with more digits, in a smaller unit or nearer to the origin")
     normal = area_normals(points, triangles)
     area = 0.5 * float(np.linalg.norm(normal, axis=1).sum())
     volume = float(np.einsum("ij,ij->", points[triangles[:, 0]], normal)) / 6
@@ -242,7 +260,7 @@ def grain_from_mesh(
         float(scale),
         area,
         volume,
-        is_convex(points, triangles, area, volume),
+        bodies == 1 and is_convex(points, triangles, step / 2 / scale),
         bodies,
         tuple(notes),
         mesh_hash(points, triangles),
@@ -253,6 +271,8 @@ def grain_from_mesh(
         where = f"{crossings.share:.2g} of test rays enter or leave it twice in a row, one at "
         way_out = "unite overlapping parts (Blender: Boolean or Remesh modifier) or thicken thin walls"
         fault = f"the surface crosses itself, or walls or gaps are thinner than {RAY_OFFSET:g} R"
+        if crossings.touching:
+            fault = f"bodies touch over a face, or gaps are thinner than {RAY_OFFSET:g} R"
         raise GrainError(f"{name}: {fault}: {where}{place(crossings.place)}; {way_out}")
     return grain
 
@@ -378,7 +398,30 @@ def check_crossings(grain: Grain, rays: int = 200_000, seed: int = 0) -> Crossin
     repeated, _ = _broken_rays(grain, scene, origin[again] + shift, direction[again])
     confirmed = suspect[repeated.reshape(-1, 4).sum(axis=1) >= 3]
     place = point[confirmed[0]] if len(confirmed) else np.zeros(3)
-    return Crossings(len(confirmed) / rays, (len(suspect) - len(confirmed)) / rays, place)
+    touching = False
+    for i in confirmed[:8]:
+        gap = _gap_on_ray(grain, origin[i], direction[i])
+        if gap is not None:
+            place, touching = gap, True
+            break
+    return Crossings(len(confirmed) / rays, (len(suspect) - len(confirmed)) / rays, place, touching)
+
+
+def _gap_on_ray(grain: Grain, origin: Floats, direction: Floats) -> Floats | None:
+    """Return where a ray leaves the material for less than `RAY_OFFSET`, measured across the facets, or None."""
+    a, b, c = (grain.vertices[grain.faces] - origin).swapaxes(0, 1)
+    inside = [np.cross(u, v) @ direction for u, v in ((a, b), (b, c), (c, a))]  # one sign: the ray meets the facet
+    met = np.flatnonzero((np.min(inside, axis=0) >= 0) | (np.max(inside, axis=0) <= 0))
+    normal = np.cross(b[met] - a[met], c[met] - a[met])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    slope = normal @ direction
+    met, normal, slope = met[slope != 0], normal[slope != 0], slope[slope != 0]
+    along = np.einsum("ij,ij->i", a[met], normal) / slope
+    leave, enter = np.flatnonzero(slope > 0), np.flatnonzero(slope < 0)
+    gap = (along[enter] - along[leave][:, None]) * slope[leave][:, None]
+    facing = normal[leave] @ normal[enter].T < -1 + 1e-6
+    at = np.argwhere((np.abs(gap) < RAY_OFFSET) & facing)
+    return origin + along[leave[at[0, 0]]] * direction if len(at) else None
 
 
 def _broken_rays(grain: Grain, scene: Any, origin: Floats, direction: Floats) -> tuple[NDArray[np.bool_], Floats]:

@@ -7,7 +7,9 @@ import numpy as np
 from tsdf.compiled import njit
 from tsdf.vectors import cross, dot, step, triple
 
-LEAF = 8  # points in the smallest box of the search for what stands before a plane
+LEAF = 16  # vertices in the smallest group of the search for what stands before a plane
+FREQUENCY = 4  # steps along an edge of the octahedron whose grid of directions bounds groups of vertices
+CHUNK = 65536  # facets at a time
 UNKNOWN = 2.0  # horizon of a facet of which nothing is promised: no sine exceeds it
 
 
@@ -64,10 +66,36 @@ def _rise(obstructed, faces, corners, normals, centroids, radii, corner_sines, h
         horizon[i] = min(top, 1.0)
 
 
-def _boxes(points):
-    """Return points (n, 3) in an order that keeps neighbours together, and boxes (2 k, 2, 3) around `LEAF` at a time.
+def _nodes():
+    """Return the nodes (4 F^2 + 2, 3) of a grid on the octahedron |x| + |y| + |z| = 1, and their index by 1 / F."""
+    steps = np.arange(-FREQUENCY, FREQUENCY + 1)
+    places = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    on = np.abs(places).sum(axis=1) == FREQUENCY
+    index = np.full((len(steps),) * 3, -1)
+    index[tuple((places[on] + FREQUENCY).T)] = np.arange(on.sum())
+    return places[on] / FREQUENCY, index
 
-    A binary tree: box 1 holds all points, box i holds boxes 2 i and 2 i + 1, and the last k boxes hold points.
+
+def _weights(normals, index):
+    """Return for each normal three nodes (m, 3) and weights (m, 3), not negative, of which it is the sum."""
+    size = np.abs(normals).sum(axis=1, keepdims=True)
+    at = np.abs(normals) / size * FREQUENCY
+    low = np.floor(at + 1e-12).astype(np.int64)
+    rest = at - low
+    left = (FREQUENCY - low.sum(axis=1))[:, None, None]  # 0 at a node, else 1 or 2: which way the small triangle points
+    corner = low[:, None] + np.where(
+        left == 2, 1 - np.eye(3, dtype=np.int64), np.where(left == 1, np.eye(3, dtype=np.int64), 0)
+    )
+    weight = np.where(left[:, 0] == 2, 1.0 - rest, np.where(left[:, 0] == 1, rest, [1.0, 0.0, 0.0]))
+    corner = np.where(normals[:, None] < 0.0, -corner, corner) + FREQUENCY
+    return index[corner[..., 0], corner[..., 1], corner[..., 2]], weight * size
+
+
+def _hulls(points, nodes):
+    """Return points in an order that keeps neighbours together, and how far groups of them reach.
+
+    The groups are a binary tree: group 1 holds all points, group i holds groups 2 i and 2 i + 1, and each of the last
+    k holds `LEAF` points; the reach (2 k, nodes) is the largest product of its points with each node.
     """
     low, high = points.min(axis=0), points.max(axis=0)
     cell = ((points - low) / np.maximum(high - low, 1e-300) * 1023.0).astype(np.int64)
@@ -77,47 +105,86 @@ def _boxes(points):
             key |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
     ordered = points[np.argsort(key, kind="stable")]
     leaves = 1 << max(0, math.ceil(math.log2(len(points) / LEAF)))
-    filled = np.resize(ordered, (leaves * LEAF, 3))
-    filled[len(points) :] = ordered[-1]
-    boxes = np.empty((2 * leaves, 2, 3))
-    blocks = filled.reshape(leaves, LEAF, 3)
-    boxes[leaves:, 0], boxes[leaves:, 1] = blocks.min(axis=1), blocks.max(axis=1)
+    filled = np.concatenate([ordered, np.broadcast_to(ordered[-1], (leaves * LEAF - len(points), 3))])
+    reach = np.empty((2 * leaves, len(nodes)))
+    for leaf in range(0, leaves, 1024):
+        products = filled[leaf * LEAF : (leaf + 1024) * LEAF] @ nodes.T
+        reach[leaves + leaf : leaves + leaf + 1024] = products.reshape(-1, LEAF, len(nodes)).max(axis=1)
     while leaves > 1:
-        pairs = boxes[leaves : 2 * leaves].reshape(leaves // 2, 2, 2, 3)
         leaves //= 2
-        boxes[leaves : 2 * leaves, 0], boxes[leaves : 2 * leaves, 1] = (
-            pairs[:, :, 0].min(axis=1),
-            pairs[:, :, 1].max(axis=1),
-        )
-    return filled, boxes
+        reach[leaves : 2 * leaves] = reach[2 * leaves : 4 * leaves].reshape(leaves, 2, -1).max(axis=1)
+    return filled, reach
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _obstruct(planes, points, boxes, horizon):
-    """Write 0 into `horizon` where no point lies before a facet's plane; boxes behind the plane are passed over."""
-    leaves = len(boxes) // 2
+def _stand_before(planes, nodes, weights, centroids, slopes, tolerance, points, reach, sides, before):
+    """Write into `before` which facets have a point further before them than the tolerance and slope allow."""
+    leaves = len(reach) // 2
     waiting = np.empty(128, np.int64)
     for i in range(len(planes)):
-        n, level = (planes[i, 0], planes[i, 1], planes[i, 2]), planes[i, 3] + 1e-9
-        waiting[0], count, before = 1, 1, False
-        while count > 0 and not before:
+        normal, level = (planes[i, 0], planes[i, 1], planes[i, 2]), planes[i, 3] + tolerance
+        a, b, c = nodes[i, 0], nodes[i, 1], nodes[i, 2]
+        u, v, w = weights[i, 0], weights[i, 1], weights[i, 2]
+        waiting[0], count = 1, 1
+        while count > 0 and not before[i]:
             count -= 1
-            box = waiting[count]
-            reach = 0.0
-            for axis in range(3):
-                reach += n[axis] * boxes[box, 1 if n[axis] > 0.0 else 0, axis]
-            if reach <= level:
+            group = waiting[count]
+            excess = u * reach[group, a] + v * reach[group, b] + w * reach[group, c] - level
+            if excess <= 0.0:
                 continue
-            if box < leaves:
-                waiting[count], waiting[count + 1] = 2 * box, 2 * box + 1
+            if slopes[i] > 0.0:
+                apart = 0.0  # to the group's box
+                for axis in range(3):
+                    at = centroids[i, axis]
+                    apart += max(-reach[group, sides[0, axis]] - at, at - reach[group, sides[1, axis]], 0.0) ** 2
+                if excess <= slopes[i] * math.sqrt(apart):
+                    continue
+            if group < leaves:
+                waiting[count], waiting[count + 1] = 2 * group, 2 * group + 1
                 count += 2
                 continue
-            for k in range((box - leaves) * LEAF, (box - leaves + 1) * LEAF):
-                if dot(n, triple(points[k])) > level:
-                    before = True
-                    break
-        if not before:
-            horizon[i] = 0.0
+            for k in range((group - leaves) * LEAF, (group - leaves + 1) * LEAF):
+                excess = dot(normal, triple(points[k])) - level
+                if excess > 0.0:
+                    off = step(triple(points[k]), -1.0, triple(centroids[i]))
+                    if excess > slopes[i] * math.sqrt(dot(off, off)):
+                        before[i] = True
+                        break
+
+
+def stand_before(
+    vertices: np.ndarray, planes: np.ndarray, centroids: np.ndarray, slopes: np.ndarray, tolerance: float
+) -> np.ndarray:
+    """Return (m,) bool which facets have a vertex of the grain before their plane.
+
+    Groups of vertices that end behind the plane are passed over. How far a group reaches along a normal is bounded by
+    how far it reaches along three nodes of a grid of directions whose weighted sum the normal is.
+
+    Parameters
+    ----------
+    vertices : (n, 3) float64
+    planes : (m, 4) float64
+        Unit normal and level of each facet's plane.
+    centroids : (m, 3) float64
+    slopes : (m,) float64
+        How much further before the plane a vertex may stand for each unit of its distance from the centroid [1].
+    tolerance : float
+        How far before the plane it may stand in any case.
+    """
+    before = np.zeros(len(planes), bool)
+    nodes, index = _nodes()
+    points, reach = _hulls(vertices, nodes)
+    f = FREQUENCY
+    sides = np.array(
+        [[index[0, f, f], index[f, 0, f], index[f, f, 0]], [index[-1, f, f], index[f, -1, f], index[f, f, -1]]]
+    )
+    for begin in range(0, len(planes), CHUNK):
+        part = slice(begin, begin + CHUNK)
+        which, weights = _weights(planes[part, :3], index)
+        _stand_before(
+            planes[part], which, weights, centroids[part], slopes[part], tolerance, points, reach, sides, before[part]
+        )
+    return before
 
 
 def horizon_of(vertices: np.ndarray, faces: np.ndarray, planes: np.ndarray) -> np.ndarray:
@@ -127,12 +194,11 @@ def horizon_of(vertices: np.ndarray, faces: np.ndarray, planes: np.ndarray) -> n
     the whole grain lies behind the facet's plane (every facet of a convex grain); UNKNOWN where nothing is promised,
     as for all facets with something before them if there are so many that looking would take longer than tracing.
     """
-    horizon = np.ones(len(planes))
-    _obstruct(planes, *_boxes(vertices), horizon)
+    corners = vertices[faces]
+    centroids = corners.mean(axis=1)
+    horizon = stand_before(vertices, planes, centroids, np.zeros(len(planes)), 1e-9).astype(np.float64)
     obstructed = np.flatnonzero(horizon)
     if 0 < len(obstructed) * len(planes) <= 1e9:
-        corners = vertices[faces]
-        centroids = corners.mean(axis=1)
         radii = np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
         sides = np.roll(corners, -1, axis=1) - corners
         sides /= np.linalg.norm(sides, axis=2)[:, :, None]

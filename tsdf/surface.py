@@ -13,11 +13,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tsdf.errors import GrainError
+from tsdf.polygons import Part, triangles_of
 
 NEAR_WELD = 1e-6  # [R] vertices of open edges closer than this are one vertex
 SLIVER_HEIGHT = 1e-9  # [R] a face less high than this has no area
 FLAT_VOLUME = 1e-9  # volume / area^1.5 of a shell without volume; a sphere has 0.094
-CONVEX_TOLERANCE = 1e-6  # [R] how far a vertex may stand before its neighbour's plane
+CONVEX_TOLERANCE = 1e-6  # [R] how far a vertex may stand before a face's plane
+MOST_ROUNDING = 2e-6  # [R] coordinates rounded more coarsely than this cannot be told from a shape
+FEWEST_LEVELS = 8  # of coordinates along an axis that tell a grid from a few chosen values
+FEWEST_CORNERS = 64  # of a mesh whose coordinates are rounded rather than chosen
+SAME_ANGLE = 1e-6  # [rad] faces about an edge that are closer than this lie on each other
 MODELLER = "use a modeller (Blender: Edit Mode, Mesh > Clean Up)"
 
 Floats = NDArray[np.float64]
@@ -110,35 +115,135 @@ def closed_faces(points: Floats, faces: Ints, notes: list[str]) -> tuple[Floats,
 
 
 def oriented(faces: Ints, name: str, notes: list[str]) -> tuple[Ints, Ints]:
-    """Return the faces consistently wound, and the shell (m,) each belongs to.
-
-    Each face stands twice in a graph, as it is and turned over; neighbours are joined in the states that
-    agree. A shell is then two components, one for each side, or one if the surface has one side only.
-    """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    m = len(faces)
-    half, edge, uses = half_edges(faces)
-    first, second = _edge_pairs(edge, uses).T
-    alike = half[first, 0] == half[second, 0]  # both run along the edge in one direction: one must turn over
-    f, g = first // 3, second // 3
-    rows, columns = np.r_[f, f + m], np.r_[g + m * alike, g + m * ~alike]
-    _, label = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), (2 * m, 2 * m)))
-    kept, turned = label[:m], label[m:]
-    if (kept == turned).any():
+    """Return the faces consistently wound, and the shell (m,) each belongs to."""
+    flip, shell = _wound(faces, _edge_pairs(*half_edges(faces)[1:]))
+    if flip is None:
         raise GrainError(f"{name}: no consistent winding exists: the surface has one side only; {MODELLER}")
-    shell = np.unique(np.minimum(kept, turned), return_inverse=True)[1]
-    flip = kept > turned
-    mostly = np.bincount(shell, flip) * 2 > np.bincount(shell)
-    flip ^= mostly[shell]
     if flip.any():
         notes.append(f"turned over {flip.sum()} inconsistently wound faces")
     return np.where(flip[:, None], faces[:, ::-1], faces), shell
 
 
-def filled(points: Floats, faces: Ints, notes: list[str]) -> tuple[Floats, Ints]:
-    """Close every hole of consistently wound faces: three edges by a face, more by a fan."""
+def _wound(faces: Ints, pairs: Ints) -> tuple[NDArray[np.bool_] | None, Ints]:
+    """Return which faces to turn over so that pairs (k, 2) of half-edges run against each other, and the shells.
+
+    Each face stands twice in a graph, as it is and turned over; neighbours are joined in the states that
+    agree. A shell is then two components, one for each side, or one if the surface has one side only: None.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    m = len(faces)
+    start = faces.reshape(-1)  # of each half-edge
+    first, second = pairs.T
+    alike = start[first] == start[second]  # both run along the edge in one direction: one must turn over
+    f, g = first // 3, second // 3
+    rows, columns = np.r_[f, f + m], np.r_[g + m * alike, g + m * ~alike]
+    _, label = connected_components(coo_array((np.ones(len(rows), np.int8), (rows, columns)), (2 * m, 2 * m)))
+    kept, turned = label[:m], label[m:]
+    shell = np.unique(np.minimum(kept, turned), return_inverse=True)[1]
+    if (kept == turned).any():
+        return None, shell
+    flip = kept > turned
+    mostly = np.bincount(shell, flip) * 2 > np.bincount(shell)
+    return flip ^ mostly[shell], shell
+
+
+def parted(points: Floats, faces: Ints, name: str, place: Any, notes: list[str]) -> tuple[Floats, Ints]:
+    """Give solids that touch along an edge vertices of their own there, so that two faces meet at every edge.
+
+    The faces about such an edge bound solid and void in turn; the two that bound one solid are joined. Where a solid
+    touches itself so that both ends of the edge stay common, the edge is divided first.
+
+    Raises
+    ------
+    GrainError
+        Faces lie on each other or are odd in number: solids touch over a face, or there are inner walls.
+    """
+    _, edge, uses = half_edges(faces)
+    count = int((uses > 2).sum())
+    if count == 0:
+        return points, faces
+    way_out = f"unite the bodies (Blender: Boolean, Union), or remove inner walls: {MODELLER}"
+    for _ in range(2):
+        half, edge, uses = half_edges(faces)
+        about = np.flatnonzero(uses[edge] > 2)
+        line = np.sort(half[about], axis=1)
+        origin, along = points[line[:, 0]], points[line[:, 1]] - points[line[:, 0]]
+        along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
+        across = np.eye(3)[np.abs(along).argmin(axis=1)]
+        across = np.cross(along, across)
+        apex = points[faces[about // 3, (about % 3 + 2) % 3]] - origin
+        angle = np.arctan2(np.einsum("ij,ij->i", apex, np.cross(along, across)), np.einsum("ij,ij->i", apex, across))
+        order = np.lexsort([angle, edge[about]])
+        about, angle = about[order], angle[order]
+        first = np.r_[True, np.diff(edge[about]) != 0]
+        last = np.roll(first, -1)
+        begin = np.flatnonzero(first)[np.cumsum(first) - 1]
+        ahead = np.where(last, begin, np.arange(len(about)) + 1)  # the next face about the same edge
+        turn = np.where(last, angle[ahead] + 2 * np.pi, angle[ahead]) - angle
+        lying = np.flatnonzero((turn < SAME_ANGLE) | (turn > 2 * np.pi - SAME_ANGLE) | (uses[edge[about]] % 2 == 1))
+        if len(lying):
+            where = place(points[half[about[lying[0]]]].mean(axis=0))
+            fault = f"{count} edges are shared by more than two faces, one at {where}"
+            raise GrainError(f"{name}: {fault}: bodies touch over a face, or there are inner walls; {way_out}")
+        pairs = _edge_pairs(edge, uses)
+        flip, whole = _wound(faces, np.vstack([pairs, np.column_stack([about, about[ahead]])]))
+        if flip is None:
+            fault = "the faces about edges where bodies touch do not bound solid and void in turn"
+            raise GrainError(f"{name}: {fault}; {way_out}")
+        flip ^= _inside_out(points, np.where(flip[:, None], faces[:, ::-1], faces), whole)
+        down = (half[about, 0] > half[about, 1]) ^ flip[about // 3]  # solid lies at larger angles
+        joined = np.vstack([pairs, np.column_stack([about, about[ahead]])[down]])
+        points, faces = _own_vertices(points, faces, joined)
+        _, edge, uses = half_edges(faces)
+        if not (uses > 2).any():
+            break
+        points, faces = _divided(points, faces, edge, uses > 2)
+    notes.append(f"solids touch along {count} edges")
+    return points, faces
+
+
+def _inside_out(points: Floats, faces: Ints, whole: Ints) -> NDArray[np.bool_]:
+    """Return (m,) of which faces the group `whole` that they belong to is inside out, if nothing is around it."""
+    volume = _shell_volumes(points, faces, whole)
+    corners = points[faces].reshape(-1, 3)
+    groups = np.repeat(whole, 3)
+    low, high = np.full((len(volume), 3), np.inf), np.full((len(volume), 3), -np.inf)
+    np.minimum.at(low, groups, corners)
+    np.maximum.at(high, groups, corners)
+    alone = np.array([((low <= a) & (high >= b)).all(axis=1).sum() == 1 for a, b in zip(low, high, strict=True)])
+    return ((volume < 0) & alone)[whole]
+
+
+def _own_vertices(points: Floats, faces: Ints, pairs: Ints) -> tuple[Floats, Ints]:
+    """Return the mesh with one vertex for the corners that pairs (k, 2) of half-edges join, and no others."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    corner = faces.reshape(-1)
+    ends = np.stack([pairs, pairs - pairs % 3 + (pairs % 3 + 1) % 3], axis=2)  # corners at both ends of each
+    same = (corner[ends[:, 0, 0]] == corner[ends[:, 1, 0]])[:, None]
+    left, right = ends[:, 0], np.where(same, ends[:, 1], ends[:, 1, ::-1])
+    rows, columns = left.ravel(), right.ravel()
+    n = len(corner)
+    _, label = connected_components(coo_array((np.ones(len(rows), np.int8), (rows, columns)), (n, n)))
+    _, first, index = np.unique(label, return_index=True, return_inverse=True)
+    return points[corner[first]], index.reshape(-1, 3)
+
+
+def _divided(points: Floats, faces: Ints, edge: Ints, which: NDArray[np.bool_]) -> tuple[Floats, Ints]:
+    """Return the mesh with a vertex in the middle of some of its edges, and the faces there divided."""
+    middle = np.where(which, len(points) + np.cumsum(which) - 1, -1)
+    half = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    first = np.unique(edge, return_index=True)[1][which]
+    points = np.vstack([points, points[half[first]].mean(axis=1)])
+    corners = np.column_stack([faces, middle[edge].reshape(-1, 3)])[:, [0, 3, 1, 4, 2, 5]]
+    return points, triangles_of(Part(points, corners[corners >= 0], (corners >= 0).sum(axis=1)))
+
+
+def filled(points: Floats, faces: Ints, notes: list[str]) -> tuple[Floats, Ints, float]:
+    """Close every hole of consistently wound faces, three edges by a face, more by a fan; say what share is new."""
     half, edge, uses = half_edges(faces)
     follow = defaultdict(list)  # the rim, run through against its faces
     for start, end in half[uses[edge] == 1].tolist():
@@ -166,8 +271,12 @@ def filled(points: Floats, faces: Ints, notes: list[str]) -> tuple[Floats, Ints]
         hub = len(points) + len(centres)
         centres.append(points[loop].mean(axis=0))
         added += [(a, b, hub) for a, b in zip(loop, loop[1:] + loop[:1], strict=True)]
-    notes.append(f"repair: closed {len(loops)} holes of {(uses == 1).sum()} edges with {len(added)} faces")
-    return np.vstack([points, *centres]), np.vstack([faces, np.array(added, np.int64).reshape(-1, 3)])
+    points, new = np.vstack([points, *centres]), np.array(added, np.int64).reshape(-1, 3)
+    area, more = (float(np.linalg.norm(area_normals(points, f), axis=1).sum()) for f in (faces, new))
+    share = more / max(area + more, 1e-300)
+    closed = f"closed {len(loops)} holes of {(uses == 1).sum()} edges with {len(added)} faces"
+    notes.append(f"repair: {closed}, {100 * share:.2g} % of the area")
+    return points, np.vstack([faces, new]), share
 
 
 def without_slivers(points: Floats, faces: Ints, notes: list[str]) -> Ints:
@@ -176,6 +285,8 @@ def without_slivers(points: Floats, faces: Ints, notes: list[str]) -> Ints:
     Its third corner lies on that edge; the flip splits the neighbour there. The surface stays as it is.
     """
     thin = int((_heights(points, faces) < SLIVER_HEIGHT).sum())
+    if thin == 0:
+        return faces
     faces = faces.copy()
     for _ in range(4 * thin):
         flat = np.flatnonzero(_heights(points, faces) < SLIVER_HEIGHT)
@@ -192,8 +303,7 @@ def without_slivers(points: Floats, faces: Ints, notes: list[str]) -> Ints:
         same = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
         if not same.all():  # d was c: the two faces were each other's back
             faces = faces[same]
-    if thin:
-        notes.append(f"flipped away {thin} faces without area")
+    notes.append(f"flipped away {thin} faces without area")
     return faces
 
 
@@ -241,7 +351,7 @@ def outward(points: Floats, faces: Ints, shell: Ints, name: str, place: Any, not
     around: list[list[int]] = []  # the shells around each shell
     for i, group in enumerate(groups):
         boxes = np.flatnonzero((low <= low[i]).all(axis=1) & (high >= high[i]).all(axis=1))
-        probes = points[np.unique(group)[:: max(1, len(group) // 8)]]
+        probes = points[group[:: max(1, len(group) // 8)]].mean(axis=1)  # vertices may touch another shell
         corners = {int(j): points[groups[j]] for j in boxes if j != i}
         # probes that disagree mean shells that cross; check_crossings finds those
         around.append([j for j, c in corners.items() if all(abs(_winding_number(c, p)) > 0.5 for p in probes)])
@@ -264,23 +374,99 @@ def outward(points: Floats, faces: Ints, shell: Ints, name: str, place: Any, not
     return np.where(turn[shell][:, None], faces[:, ::-1], faces), bodies
 
 
-def is_convex(points: Floats, faces: Ints, area: float, volume: float) -> bool:
-    """Tell whether a mesh is convex: no neighbour before a face's plane, the size of its hull."""
-    from scipy.spatial import ConvexHull, QhullError
+def is_convex(points: Floats, faces: Ints, rounding: float = 0.0) -> bool:
+    """Tell whether all of a mesh lies behind the plane of each of its faces, within what its digits allow.
 
-    half, edge, uses = half_edges(faces)
-    first, second = _edge_pairs(edge, uses).T
+    A vertex may stand `CONVEX_TOLERANCE` before a plane. Where coordinates are rounded, the plane itself is uncertain,
+    the more the further from the face and the less high the face: 4 `rounding` (1 + distance / height) is added.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Vertices [R].
+    faces : (m, 3) int64
+        Counter-clockwise seen from the void.
+    rounding : float
+        How far a coordinate may be off [R], from `grid_step`; more than `MOST_ROUNDING` counts as that.
+    """
+    from tsdf.horizon import stand_before
+
     normal = area_normals(points, faces)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    beyond = faces[second // 3, (second % 3 + 2) % 3]  # the neighbour's vertex off the common edge
-    height = np.einsum("ij,ij->i", normal[first // 3], points[beyond] - points[half[first, 0]])
-    if height.max() > CONVEX_TOLERANCE:
-        return False
-    try:
-        hull = ConvexHull(points)
-    except QhullError:
-        return False
-    return abs(hull.volume - volume) < CONVEX_TOLERANCE and abs(hull.area - area) < 10 * CONVEX_TOLERANCE
+    corners = points[faces]
+    level = np.einsum("ijk,ik->ij", corners, normal).max(axis=1)
+    rounding = min(rounding, MOST_ROUNDING)
+    slopes = 4 * rounding / _heights(points, faces)
+    tolerance = CONVEX_TOLERANCE + 4 * rounding
+    return not stand_before(points, np.column_stack([normal, level]), corners.mean(axis=1), slopes, tolerance).any()
+
+
+def grid_step(points: Floats) -> float:
+    """Return the largest step of a grid on which all coordinates stand for want of digits, 0 if there is none.
+
+    Numbers of float32 stand on a grid of the last bit of the largest of them, written decimals on a power of ten, and
+    numbers of either that were scaled afterwards on any; the last is looked for where an axis has eight levels or more.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Vertices, as the file has them.
+    """
+    largest = float(np.abs(points).max())
+    bits = 2.0**-23 if (points == points.astype(np.float32)).all() else 2.0**-52
+    unsure = bits * 2.0 ** np.floor(np.log2(max(largest, 1e-300)))  # the last bit of the largest
+    steps = [unsure if bits == 2.0**-23 else 0.0]
+    for power in range(int(np.floor(np.log10(max(largest, 1e-300)))), -300, -1):
+        step = 10.0**power
+        if step <= 100 * unsure:  # finer grids fit anything
+            break
+        if (np.abs(points - step * np.rint(points / step)) <= 2 * unsure).all():
+            steps.append(step)
+            break
+    axes = [_spacing(axis, unsure) for axis in points.T]
+    return max(*steps, max(axes) if min(axes) > 0 else 0.0)
+
+
+def _spacing(values: Floats, unsure: float) -> float:
+    """Return the common spacing of values that stand on eight levels of a grid or more, 0 if there is none."""
+    levels = np.unique(values)
+    gaps = np.diff(levels)
+    step = gaps[gaps > 8 * unsure].min(initial=np.inf)
+    if not np.isfinite(step):
+        return 0.0
+    step = (levels[-1] - levels[0]) / max(np.rint((levels[-1] - levels[0]) / step), 1.0)
+    rest = (levels - levels[0]) / step
+    enough = len(np.unique(np.rint(rest))) >= FEWEST_LEVELS
+    return float(step) if enough and (np.abs(rest - np.rint(rest)) < 0.02).all() else 0.0
+
+
+def grid_tilt(points: Floats, faces: Ints, step: float) -> float:
+    """Return by how much facets are tilted where coordinates are rounded to a grid, the mean over the area [rad].
+
+    A facet with heights h is tilted by sqrt(sum of 1 / h^2) step / sqrt(12) for independent corners. None is if the
+    grid is a design: facets along the axes (voxels), corners in the middle of a grid's edges (marching cubes on
+    binary data), or fewer than `FEWEST_CORNERS`.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Vertices [R].
+    faces : (m, 3) int64
+    step : float
+        Of the grid [R].
+    """
+    if step == 0 or len(points) < FEWEST_CORNERS:
+        return 0.0
+    odd = np.rint((points - points.min(axis=0)) / step).astype(np.int64) % 2
+    for turned in np.ndindex(2, 2, 2):
+        if ((odd ^ turned).sum(axis=1) == 1).all():
+            return 0.0
+    normal = area_normals(points, faces)
+    double = np.linalg.norm(normal, axis=1)
+    sides = np.linalg.norm(points[faces] - points[np.roll(faces, -1, axis=1)], axis=2)
+    tilt = np.minimum(np.sqrt((sides**2).sum(axis=1)) / double * step / np.sqrt(12), 1.0)
+    tilt[np.abs(normal).max(axis=1) > (1 - 1e-9) * double] = 0.0
+    return float(np.average(tilt, weights=double))
 
 
 def mesh_hash(points: Floats, faces: Ints) -> str:
