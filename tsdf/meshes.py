@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from tsdf.errors import GrainError
 from tsdf.gltf import read_gltf
 from tsdf.polygons import Budget, Floats, Ints, Part, strip_triangles, triangle_part, triangles_of
+from tsdf.surface import equal_vertices
 from tsdf.vtk import numbers, read_vtk
 
 LARGEST_FILE = 2**31  # bytes
@@ -214,7 +215,7 @@ def _read_ply(data: bytes) -> list[Part]:
             places = np.column_stack([values[axis] for axis in "xyz"]).astype(np.float64)
         for key in ("vertex_indices", "vertex_index"):
             if name in ("face", "tristrips") and key in values:
-                corners, sizes = values[key]
+                corners, sizes = _whole(values[key][0]), values[key][1]
                 parts.append(_strips(places, corners, sizes) if name == "tristrips" else Part(places, corners, sizes))
     return parts or [Part(places, np.empty(0, np.int64), np.empty(0, np.int64))]
 
@@ -293,7 +294,7 @@ def _binary_rows(body: bytes, at: int, count: int, columns: list[Column], order:
         width = np.dtype(column.kind).itemsize
         first = np.repeat(begin - width * (np.cumsum(mine) - mine), mine) + width * np.arange(mine.sum())
         value = raw[first[:, None] + np.arange(width)].reshape(-1).view(order + column.kind)
-        values[column.name] = (_whole(value), mine) if column.length else value
+        values[column.name] = (value, mine) if column.length else value
         begin = begin + width * mine
     return values, at
 
@@ -320,7 +321,7 @@ def _text_rows(text: Floats, at: int, count: int, columns: list[Column]) -> tupl
             sizes[k].append(length)
             i += length
     return {
-        column.name: (_whole(np.array(found[k])), np.array(sizes[k], np.int64)) if column.length else np.array(found[k])
+        column.name: (np.array(found[k]), np.array(sizes[k], np.int64)) if column.length else np.array(found[k])
         for k, column in enumerate(columns)
     }, at + i
 
@@ -341,7 +342,7 @@ STL_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attrib
 
 
 def _read_stl(data: bytes) -> list[Part]:
-    """Facets of an STL; it is binary if the number of facets that it would announce then fits its length."""
+    """Facets of an STL, equal corners as one vertex; binary if the number it would announce then fits its length."""
     count = int.from_bytes(data[80:84], "little")
     if len(data) >= 84 and (len(data) == 84 + 50 * count or data.lstrip()[:5].lower() != b"solid"):
         if 84 + 50 * count > len(data):
@@ -353,7 +354,8 @@ def _read_stl(data: bytes) -> list[Part]:
         corners = np.array([words[i + 1 : i + 4] for i in at], np.float64).reshape(-1, 3)
         if len(corners) % 3:
             raise ValueError("ends within a facet")
-    return [triangle_part(corners, np.arange(len(corners)).reshape(-1, 3))]
+    used, index = np.unique(equal_vertices(corners), return_inverse=True)
+    return [triangle_part(corners[used], index.reshape(-1, 3))]
 
 
 # --------------------------------------------------------------------------------------------- 3MF and DAE
@@ -491,8 +493,8 @@ def _read_dae(data: bytes) -> list[Part]:
             if getattr(primitive, "vertex", None) is None or primitive.vertex_index is None:
                 continue
             index = np.asarray(primitive.vertex_index, np.int64)
-            if hasattr(primitive, "polyends"):
-                part = Part(primitive.vertex, index.reshape(-1), primitive.polyends - primitive.polystarts)
+            if hasattr(primitive, "polyindex"):
+                part = Part(primitive.vertex, index.reshape(-1), np.diff(primitive.polyindex)[:, 0].astype(np.int64))
             elif index.ndim == 2 and index.shape[1] == 3:
                 part = triangle_part(primitive.vertex, index)
             else:
