@@ -9,12 +9,13 @@ import argparse
 import base64
 import io
 import json
-import multiprocessing
 import os
 import random
 import re
 import resource
+import select
 import struct
+import subprocess
 import sys
 import tempfile
 import time
@@ -343,8 +344,8 @@ def cases(count: int, seed: int) -> "list[tuple[str, bytes]]":
 # --------------------------------------------------------------------------------------------- the loading
 
 
-def _work(pipe: object) -> None:
-    """Load the files that come through a pipe and say what came of each."""
+def work() -> None:
+    """Load the files named on standard input, a line each, and answer in a line what came of each."""
     import warnings
 
     from tsdf.errors import TSDFError
@@ -354,50 +355,49 @@ def _work(pipe: object) -> None:
     load_grain("snow")  # everything is imported and compiled
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, size + MEMORY))
-    pipe.send("ready")  # type: ignore[attr-defined]
-    while True:
-        path = pipe.recv()  # type: ignore[attr-defined]
+    print(json.dumps("ready"), flush=True)
+    for line in sys.stdin:
+        path = json.loads(line)
         try:
             load_grain(path)
             answer = "a grain"
         except TSDFError as error:
-            text = str(error)
-            answer = "an error of ours"
-            if "\n" in text or Path(path).name not in text or "memory" in text:
-                answer = f"wrong: {text}"
+            answer = f"an error of ours: {error}"
+            if "\n" in answer or Path(path).name not in answer or "memory" in answer:
+                answer = f"wrong: {error}"
         except BaseException as error:
             answer = f"wrong: {type(error).__name__}: {error}"
-        pipe.send(answer)  # type: ignore[attr-defined]
+        print(json.dumps(answer), flush=True)
 
 
 class Loader:
     """A process that loads grains, replaced when it hangs or dies."""
 
     def __init__(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._pipe, end = context.Pipe()
-        self._process = context.Process(target=_work, args=(end,), daemon=True)
-        self._process.start()
-        end.close()
-        self._pipe.recv()
+        command = [sys.executable, __file__, "--work"]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._answer(600)  # the first may compile
+
+    def _answer(self, seconds: float) -> str:
+        if not select.select([self._process.stdout], [], [], seconds)[0]:
+            return f"wrong: no answer within {seconds} s"
+        line = self._process.stdout.readline()
+        return json.loads(line) if line else "wrong: the process died"
 
     def load(self, path: Path) -> str:
         """Return what came of a file."""
-        self._pipe.send(str(path))
-        try:
-            if self._pipe.poll(SECONDS):
-                return self._pipe.recv()
-            answer = f"wrong: no answer within {SECONDS} s"
-        except EOFError:
-            answer = "wrong: the process died"
-        self.close()
-        self.__init__()  # type: ignore[misc]
+        self._process.stdin.write(json.dumps(str(path)) + "\n")
+        self._process.stdin.flush()
+        answer = self._answer(SECONDS)
+        if answer in ("wrong: the process died", f"wrong: no answer within {SECONDS} s"):
+            self.close()
+            self.__init__()  # type: ignore[misc]
         return answer
 
     def close(self) -> None:
         """End the process."""
         self._process.kill()
-        self._process.join()
+        self._process.communicate()
 
 
 def main(count: int, seconds: float = float("inf"), seed: int = 0, keep: Path | None = None) -> Counter:
@@ -414,7 +414,7 @@ def main(count: int, seconds: float = float("inf"), seed: int = 0, keep: Path | 
             start = time.monotonic()
             answer = loader.load(path)
             slowest = max(slowest, time.monotonic() - start)
-            ends[answer] += 1
+            ends[answer if answer.startswith("wrong") else answer.partition(":")[0]] += 1
             if answer.startswith("wrong"):
                 print(f"{k} {name}: {answer}", flush=True)
                 if keep is not None:
@@ -433,7 +433,10 @@ if __name__ == "__main__":
     options.add_argument("--seconds", type=float, default=float("inf"), help="time after which to stop")
     options.add_argument("--seed", type=int, default=0)
     options.add_argument("--keep", type=Path, help="folder for the files that went wrong")
+    options.add_argument("--work", action="store_true", help=argparse.SUPPRESS)
     given = options.parse_args()
+    if given.work:
+        sys.exit(work())
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     result = main(given.count, given.seconds, given.seed, given.keep)
     sys.exit(any(end.startswith("wrong") for end in result))

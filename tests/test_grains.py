@@ -485,6 +485,68 @@ def test_one_sided_surface():
     refused("one side only", np.random.default_rng(0).normal(size=(n * n, 3)), faces)
 
 
+def box(at=(0, 0, 0), sides=(1, 1, 1)):
+    """A box of its own vertices."""
+    vertices, faces = mesh()
+    return (vertices + 0.5) * sides + at, faces
+
+
+@pytest.mark.parametrize(("at", "radius"), [((1, 1, 1), 3**0.5), ((1, 1, 0), 1.5), ((-1, 0, 1), 1.5)])
+def test_bodies_that_touch_in_a_corner_or_along_an_edge(at, radius):
+    """Each closed: bodies of their own, with vertices of their own, however their faces are wound."""
+    vertices, faces = joined(box(), box(at))
+    for turned in (faces, faces[:, ::-1], np.vstack([faces[:12], faces[12:, ::-1]]), flipped((0, faces[::-1]))[1]):
+        grain = grain_from_mesh(vertices, turned)
+        scale = grain.bounding_radius
+        assert (grain.volume * scale**3, grain.area * scale**2) == pytest.approx((2, 12)) and grain.bodies == 2
+        assert scale == pytest.approx(radius) and not grain.convex
+        edges = np.sort(grain.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+
+
+@pytest.mark.parametrize("at", [(1, 0, 0), (1, 0.3, 0.2), (0, 1, 0.5), (0.25, 0.25, 1)])
+def test_bodies_that_touch_over_a_face(at):
+    """Over a whole face, whatever its diagonal, or over part of one: refused, and it says so."""
+    sides = (0.5, 0.5, 1) if at[2] == 1 else (1, 1, 1)
+    refused("bodies touch over a face", *joined(box(), box(at, sides)))
+    vertices, faces = box(at, sides)
+    mirrored = vertices * [1, 1, -1] + [0, 0, 2 * at[2] + sides[2]]  # has the other diagonals
+    refused("bodies touch over a face", *joined(box(), (mirrored, faces[:, ::-1])))
+
+
+def voxels(cells):
+    """The outer faces of the cells of a volume, two triangles each, with common vertices."""
+    inside = np.pad(cells, 1)
+    n = np.array(inside.shape) + 1
+    found = []
+    for axis, side in itertools.product(range(3), (0, 1)):
+        at = np.argwhere(inside & ~np.roll(inside, 1 - 2 * side, axis))
+        u, v = np.eye(3, dtype=int)[[(axis + 1) % 3, (axis + 2) % 3]]
+        corner = at + side * np.eye(3, dtype=int)[axis]
+        ring = [corner, corner + u, corner + u + v, corner + v][:: 2 * side - 1]
+        a, b, c, d = (np.ravel_multi_index(p.T, n) for p in ring)
+        found += [np.column_stack([a, b, c]), np.column_stack([a, c, d])]
+    return np.argwhere(np.ones(n, bool)).astype(float), np.vstack(found)
+
+
+@pytest.mark.parametrize(("shape", "share"), [((2, 2, 2), 0.5), ((3, 3, 3), 0.4), ((5, 6, 7), 0.35), ((7, 6, 5), 0.75)])
+def test_clusters_of_voxels(shape, share):
+    """Random volumes: V and A count cells and faces; bodies are cells joined over faces, found by other means."""
+    from scipy.ndimage import label
+
+    rng = np.random.default_rng(6)
+    cells = rng.random(shape) < share
+    cells[0, 0, 0] = True
+    vertices, faces = voxels(cells)
+    mixed = np.where(rng.random((len(faces), 1)) < 0.2, faces[:, ::-1], faces)
+    for given in (faces, mixed):
+        grain = grain_from_mesh(vertices, given)
+        scale = grain.bounding_radius
+        assert grain.volume * scale**3 == pytest.approx(cells.sum()) and grain.bodies == label(cells)[1]
+        assert grain.area * scale**2 == pytest.approx(len(faces) / 2)
+        assert not any("grid" in note for note in grain.notes)
+
+
 def test_no_volume():
     """Two sheets back to back between equal corners, and a flattened cube."""
     refused("no volume", mesh()[0] * [1, 1, 0] + 1e-3 * np.arange(8)[:, None] * [1, 1, 0], mesh()[1])
@@ -532,6 +594,75 @@ def test_convexity(height, convex):
     vertices = vertices.copy()
     vertices[0] = vertices[ring].mean(axis=0) + height * vertices[0]
     assert grain_from_mesh(vertices, faces).convex == convex
+
+
+def sphere_on_a_grid(subdivisions, digits):
+    """An icosphere of radius 1 written with so many decimals."""
+    vertices, faces = mesh("icosphere", subdivisions=subdivisions)
+    return vertices.round(digits), faces
+
+
+@pytest.mark.parametrize("name", list(exemplars.EXEMPLARS))
+def test_convex_within_its_digits(name):
+    """A convex crystal stays convex in float32, near and far, and in six decimals; a concave one stays concave."""
+    coarse = {"subdivisions": 3} if "subdivisions" in exemplars.EXEMPLARS[name].parameters else {}
+    grain = load_grain(name, **coarse)
+    for given in ((grain.vertices * 1e-4).astype(np.float32), (grain.vertices + 50).astype(np.float32),
+                  grain.vertices.round(6)):  # fmt: skip
+        again = grain_from_mesh(given, grain.faces)
+        assert again.convex == grain.convex and again.notes == ()
+
+
+@pytest.mark.parametrize("given", [{"aspect": 20}, {"aspect": 0.01}, {"bevel": 0.001}])
+def test_slender_crystals_are_convex_within_their_digits(given):
+    vertices, faces = mesh("cube" if "bevel" in given else "hexprism", **given)
+    spin = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    assert grain_from_mesh((vertices @ spin).astype(np.float32), faces).convex
+
+
+def test_a_dent_is_no_rounding():
+    """The same float32 sphere with one vertex a thousandth of R too deep, and the concave prism on a coarse grid."""
+    vertices, faces = mesh("icosphere", subdivisions=4)
+    assert grain_from_mesh((vertices + 3).astype(np.float32), faces).convex
+    vertices = vertices.copy()
+    ring = np.setdiff1d(faces[(faces == 0).any(axis=1)], 0)
+    vertices[0] = 0.999 * vertices[ring].mean(axis=0)
+    assert not grain_from_mesh((vertices + 3).astype(np.float32), faces).convex
+    assert not grain_from_mesh(*voxels(np.array([[[1, 1], [1, 0]]], bool))).convex
+
+
+@pytest.mark.parametrize("scale", [1.0, 50e-6, 0.37])
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_digits_that_ran_out(scale, kind):
+    """A sphere of which 2 % of R is the last digit: said, with the share, whatever the unit and the type."""
+    vertices, faces = mesh("icosphere", subdivisions=4)
+    grain = grain_from_mesh((np.rint(vertices * 50) * (scale / 50)).astype(kind), faces)
+    assert len(grain.notes) == 1 and "on a grid of 2 % of R" in grain.notes[0] and "more digits" in grain.notes[0]
+    assert grain_from_mesh((np.rint(vertices * 5000) * (scale / 5000)).astype(kind), faces).notes == ()
+
+
+def test_far_from_the_origin_digits_run_out():
+    """Micrometres at a place given in metres, in float32."""
+    vertices, faces = mesh("icosphere", subdivisions=4)
+    grain = grain_from_mesh((vertices * 1e-4 + 30).astype(np.float32), faces)
+    assert "on a grid of 1.9 % of R" in grain.notes[0] and "nearer to the origin" in grain.notes[0]
+
+
+def test_grids_that_are_meant():
+    """Whole numbers of a few corners, voxels, marching cubes on binary data (corners in the middle of edges)."""
+    for name in ("cube", "octahedron", "tetrahedron"):
+        assert grain_from_mesh(np.rint(mesh(name)[0] * 40), mesh(name)[1]).notes == ()
+    i = np.arange(16) - 7.5
+    ball = (i[:, None, None] ** 2 + i[:, None] ** 2 + i**2) < 45
+    vertices, faces = voxels(ball)
+    assert grain_from_mesh(vertices, faces).notes == ()
+    assert grain_from_mesh((vertices * 0.37 + 2).astype(np.float32), faces).notes == ()
+    ball, sides = mesh("icosphere", subdivisions=3)
+    rounded = np.rint(ball * 50)
+    assert "on a grid of 2 % of R" in grain_from_mesh(rounded, sides).notes[0]
+    middles = 2 * np.rint(rounded / 2)  # one odd coordinate each
+    middles[np.arange(len(ball)), np.abs(ball).argmax(axis=1)] += 1
+    assert grain_from_mesh(middles, sides).notes == ()
 
 
 def test_wall_too_thin():
@@ -587,13 +718,30 @@ def test_repair_closes_holes():
     assert grain.volume == pytest.approx(4 * np.pi / 3, rel=0.02)
 
 
+@pytest.mark.parametrize("kept", [0.5, 0.0, 0.9])
+def test_repair_says_what_is_new(kept):
+    """A closed half is no repair unless asked for; the area of the flat cap over all area is what it says."""
+    ball, faces = mesh("icosphere", subdivisions=4)
+    open_ball = faces[ball[faces].mean(axis=1)[:, 2] < kept]
+    cap = np.pi * (1 - kept**2)
+    expected = 100 * cap / (cap + 2 * np.pi * (1 + kept))
+    if expected > 10:
+        message = refused("more than a tenth", ball, open_ball, repair=True)
+        assert float(message.partition("would make ")[2].split()[0]) == pytest.approx(
+            expected, rel=0.25
+        )  # the rim is jagged
+    grain = grain_from_mesh(ball, open_ball, repair="any")
+    said = float(grain.notes[0].rpartition(", ")[2].split()[0])
+    assert said == pytest.approx(expected, rel=0.25) and grain.notes[0].endswith("% of the area")
+
+
 def test_repair_of_holes_that_touch():
     """Two holes with one common vertex are two holes."""
     vertices, faces = mesh("icosphere", subdivisions=2)
     at = np.flatnonzero((faces == 0).any(axis=1))
     apart = next(f for f in at[1:] if len(np.intersect1d(faces[f], faces[at[0]])) == 1)
     grain = grain_from_mesh(vertices, np.delete(faces, [at[0], apart], axis=0), repair=True)
-    assert grain.notes == ("repair: closed 2 holes of 6 edges with 2 faces, 0.51 % of the area",)
+    assert grain.notes == ("repair: closed 2 holes of 6 edges with 2 faces, 0.58 % of the area",)
     assert grain.mesh_hash == load_grain("icosphere", subdivisions=2).mesh_hash
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsdf.errors import GrainError
-from tsdf.polygons import Budget, Floats, Ints, Part, fan_triangles, strip_triangles, triangle_part
+from tsdf.polygons import MOST_PIECES, Budget, Floats, Ints, Part, fan_triangles, strip_triangles, triangle_part
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3}
@@ -81,6 +81,7 @@ class _Document:
         self._buffers: dict[int, NDArray[np.uint8]] = {}
         self._meshes: dict[int, list[Part]] = {}
         self._made: dict[int, NDArray] = {}
+        self._budget: Budget | None = None
 
     def _item(self, what: str, index: Any) -> dict:
         """Return an object of one of the file's lists."""
@@ -109,6 +110,8 @@ class _Document:
             if index in seen:
                 raise ValueError(f"node {index} stands in its scene twice")
             seen.add(index)
+            if len(seen) > MOST_PIECES:
+                raise GrainError(f"its scene has more than {MOST_PIECES} nodes; join them")
             if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
                 raise GrainError(f"node {index} uses EXT_mesh_gpu_instancing, which is not read; {WAY_OUT}")
             matrix = outer @ _transform(node)
@@ -127,7 +130,7 @@ class _Document:
     def _mesh(self, index: int) -> list[Part]:
         """Return the primitives of a mesh that have faces."""
         if index not in self._meshes:
-            budget = Budget(self.size)
+            budget = self._budget = self._budget or Budget(self.size)
             primitives = [p for p in self._item("meshes", index)["primitives"] if p.get("mode", 4) in (4, 5, 6)]
             self._meshes[index] = [part for p in primitives if len((part := budget.spend(self._primitive(p))).sizes)]
         return self._meshes[index]

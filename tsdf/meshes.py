@@ -10,7 +10,9 @@ Nothing is merged or checked here: what makes a closed surface of it is `surface
 import io
 import re
 import stat
+import warnings
 import zipfile
+from array import array
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +23,7 @@ from numpy.typing import NDArray
 
 from tsdf.errors import GrainError
 from tsdf.gltf import read_gltf
-from tsdf.polygons import Budget, Floats, Ints, Part, strip_triangles, triangle_part, triangles_of
+from tsdf.polygons import MOST_PIECES, Budget, Floats, Ints, Part, strip_triangles, triangle_part, triangles_of
 from tsdf.surface import equal_vertices
 from tsdf.vtk import numbers, read_vtk
 
@@ -52,7 +54,11 @@ def read_mesh(path: Path) -> tuple[NDArray, NDArray]:
     try:
         _check_kind(path)
         data = path.read_bytes()
-        parts, size = READERS[path.suffix.lower()](data, path.parent)
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            parts, size = READERS[path.suffix.lower()](data, path.parent)
+            budget = Budget(size)
+            faces = [triangles_of(budget.spend(part)) for part in parts]
     except GrainError as error:
         raise GrainError(f"{path}: {error}") from None
     except (MemoryError, RecursionError):
@@ -60,17 +66,9 @@ def read_mesh(path: Path) -> tuple[NDArray, NDArray]:
     except Exception as error:  # a damaged file: whatever reading it runs into
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise GrainError(f"{path}: cannot be read as a mesh ({reason}); {WAY_OUT}") from None
-    count = sum(int(np.maximum(part.sizes - 2, 0).sum()) for part in parts)
-    if count == 0:
+    if not any(map(len, faces)):
         what = "points or lines but no faces" if any(len(part.points) for part in parts) else "no mesh"
         raise GrainError(f"{path}: holds {what}; a grain is a closed triangle mesh")
-    try:
-        budget = Budget(size)
-        for part in parts:
-            budget.spend(part)
-        faces = [triangles_of(part) for part in parts]
-    except GrainError as error:
-        raise GrainError(f"{path}: {error}") from None
     starts = np.cumsum([0] + [len(part.points) for part in parts[:-1]])
     return (
         np.vstack([part.points for part in parts]),
@@ -360,8 +358,7 @@ def _read_stl(data: bytes) -> list[Part]:
 
 # --------------------------------------------------------------------------------------------- 3MF and DAE
 
-INFLATED = 256_000_000  # bytes of the models in a 3MF; XML of as many takes 20 s
-MOST_PLACED = 100_000  # objects in a scene
+INFLATED = 100_000_000  # bytes of the models in a 3MF
 MAY_REQUIRE = (
     "http://schemas.microsoft.com/3dmanufacturing/production/2015/06",
     "http://schemas.microsoft.com/3dmanufacturing/material/2015/02",
@@ -376,15 +373,15 @@ def _read_3mf(data: bytes) -> list[Part]:
     if sum(entry.file_size for entry in models) > INFLATED:
         raise GrainError(f"its models are larger than {INFLATED} bytes when inflated; export it as PLY or STL")
     objects: dict[tuple[str, str], tuple[Part | None, list[tuple[str, str, Floats]]]] = {}
+    budget = Budget(len(data))
     items: list[tuple[str, str, Floats]] = []
     for entry in models:
         file = "/" + entry.filename.lstrip("/").lower()
         with archive.open(entry) as stream:
-            mine = _read_model(stream, file, objects)
+            mine = _read_model(stream, file, objects, budget.most)
         if not file.startswith("/3d/objects") and (file.endswith("3dmodel.model") or len(models) == 1):
             items += mine
     parts: list[Part] = []
-    budget = Budget(len(data))
     waiting = [(*item, 0) for item in items]
     while waiting:
         file, index, matrix, depth = waiting.pop()
@@ -394,8 +391,9 @@ def _read_3mf(data: bytes) -> list[Part]:
         if part is not None:
             turned = part.corners if np.linalg.det(matrix[:3]) > 0 else part.corners.reshape(-1, 3)[:, ::-1].reshape(-1)
             parts.append(budget.spend(Part(part.points @ matrix[:3] + matrix[3], turned, part.sizes)))
-        if depth > 32 or len(parts) + len(waiting) + len(components) > MOST_PLACED:
-            raise ValueError(f"objects within objects more than 32 deep, or more than {MOST_PLACED} of them")
+        budget.take(0)
+        if depth > 32 or len(waiting) + len(components) > MOST_PIECES:
+            raise GrainError(f"objects within objects more than 32 deep, or more than {MOST_PIECES} of them; {WAY_OUT}")
         for below, name, inner in components:
             waiting.append(
                 (below, name, np.vstack([inner[:3] @ matrix[:3], inner[3] @ matrix[:3] + matrix[3]]), depth + 1)
@@ -403,7 +401,7 @@ def _read_3mf(data: bytes) -> list[Part]:
     return parts
 
 
-def _read_model(stream: Any, file: str, objects: dict) -> list[tuple[str, str, Floats]]:
+def _read_model(stream: Any, file: str, objects: dict, most: int) -> list[tuple[str, str, Floats]]:
     """Add the objects of one model of a 3MF to `objects` and return its build items: file, object, matrix (4, 3)."""
 
     def local(name: str) -> str:
@@ -415,8 +413,7 @@ def _read_model(stream: Any, file: str, objects: dict) -> list[tuple[str, str, F
         return "/" + elsewhere.lstrip("/").lower(), element.attrib["objectid"], np.array(words, float).reshape(4, 3)
 
     items, components = [], []
-    points: list[tuple[str, str, str]] = []
-    faces: list[tuple[str, str, str]] = []
+    points, faces = array("d"), array("q")
     spaces: dict[str, str] = {}
     mesh: Part | None = None
     stack: list[ElementTree.Element] = []
@@ -435,12 +432,12 @@ def _read_model(stream: Any, file: str, objects: dict) -> list[tuple[str, str, F
                 raise GrainError(f"holds a {name}, which is not read; {WAY_OUT}")
             continue
         if name == "vertex":
-            points.append((element.attrib["x"], element.attrib["y"], element.attrib["z"]))
+            points.extend(float(element.attrib[axis]) for axis in "xyz")
         elif name == "triangle":
-            faces.append((element.attrib["v1"], element.attrib["v2"], element.attrib["v3"]))
+            faces.extend(int(element.attrib[corner]) for corner in ("v1", "v2", "v3"))
         elif name == "mesh":
-            mesh = triangle_part(np.array(points, float).reshape(-1, 3), np.array(faces, np.int64).reshape(-1, 3))
-            points, faces = [], []
+            mesh = triangle_part(np.array(points).reshape(-1, 3), np.array(faces).reshape(-1, 3))
+            points, faces = array("d"), array("q")
         elif name == "component":
             components.append(target(element))
         elif name == "object":
@@ -451,6 +448,8 @@ def _read_model(stream: Any, file: str, objects: dict) -> list[tuple[str, str, F
         stack.pop()
         if stack:
             stack[-1].remove(element)  # what has been read leaves the tree
+        if len(points) > 9 * most or len(faces) > 3 * most:
+            raise GrainError(f"a mesh of more than {most} triangles; simplify it, or export it as PLY or STL")
     return items
 
 
@@ -500,8 +499,6 @@ def _read_dae(data: bytes) -> list[Part]:
             else:
                 continue
             parts.append(budget.spend(part))
-            if len(parts) > MOST_PLACED:
-                raise ValueError(f"more than {MOST_PLACED} objects")
     return parts
 
 

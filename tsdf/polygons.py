@@ -14,7 +14,9 @@ from tsdf.errors import GrainError
 
 MOST_CORNERS = 5_000  # of one polygon: clipping ears takes up to their square
 MANY_FACES = 1_000_000  # more triangles than this only of a file with ten bytes for each
-FLAT = 1e-9  # a triangle of less than this share of its polygon's area has none
+MOST_PIECES = 100_000  # objects, primitives or nodes in a file
+THIN = 0.02  # height of a triangle over its longest side below which another is looked for
+SLIVER = 1e-3  # the same of a fan or a quadrangle: with thinner ones ears are clipped instead
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -39,22 +41,29 @@ class Part(NamedTuple):
 
 
 class Budget:
-    """How many triangles, and three times as many points, may still come out of a file of `size` bytes.
+    """How many triangles, three times as many points, and `MOST_PIECES`, may come out of a file of `size` bytes.
 
     A file can name the same mesh many times over, so that a few bytes stand for more than fits into memory.
     """
 
     def __init__(self, size: int) -> None:
-        self._size, self._left = size, max(MANY_FACES, size // 10)
+        self.most = max(MANY_FACES, size // 10)
+        self._size, self._left, self._pieces = size, self.most, MOST_PIECES
 
     def spend(self, part: Part) -> Part:
         """Return the part, or raise GrainError if it is one too many."""
-        self._left -= max(len(part.corners) - 2 * len(part.sizes), len(part.points) // 3)
-        if self._left < 0:
-            most = max(MANY_FACES, self._size // 10)
-            fault = f"stands for more than {most} triangles in {self._size} bytes"
-            raise GrainError(f"{fault}; export it without instances or compression, or simplify it")
+        self.take(max(len(part.corners) - 2 * len(part.sizes), len(part.points) // 3))
         return part
+
+    def take(self, triangles: int) -> None:
+        """Count one piece of so many triangles."""
+        self._left -= triangles
+        self._pieces -= 1
+        if self._left < 0:
+            fault = f"stands for more than {self.most} triangles in {self._size} bytes"
+            raise GrainError(f"{fault}; export it without instances or compression, or simplify it")
+        if self._pieces < 0:
+            raise GrainError(f"is made of more than {MOST_PIECES} pieces; join them")
 
 
 def triangle_part(points: ArrayLike, triangles: ArrayLike) -> Part:
@@ -96,6 +105,8 @@ def triangles_of(part: Part) -> Ints:
     points, corners, sizes = part
     if len(sizes) == 0:
         return np.empty((0, 3), np.int64)
+    if sizes.min() < 0 or sizes.sum() != len(corners):
+        raise GrainError(f"its faces take {sizes.sum()} corners of {len(corners)}; export the mesh again")
     starts = np.cumsum(sizes) - sizes
     wrong = np.flatnonzero((corners < 0) | (corners >= len(points)))
     if len(wrong):
@@ -145,11 +156,13 @@ def _newell(loops: Floats) -> Floats:
 
 
 def _one_way(points: Floats, loops: Ints, triangles: Ints) -> NDArray[np.bool_]:
-    """Tell of which polygons (m, size) all triangles (m, size - 2, 3) are wound as the whole, and have an area."""
+    """Tell of which polygons (m, size) all triangles (m, size - 2, 3) are wound as the whole, and none is a sliver."""
     normal = _newell(points[loops])
-    a, b, c = np.moveaxis(points[triangles], 2, 0)
-    turned = np.einsum("ijk,ik->ij", np.cross(b - a, c - a), normal)
-    return (turned > FLAT * np.einsum("ij,ij->i", normal, normal)[:, None]).all(axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    corners = points[triangles]
+    sides = np.roll(corners, -1, axis=2) - corners
+    double = np.einsum("ijk,ik->ij", np.cross(sides[:, :, 0], sides[:, :, 1]), normal)
+    return (double > SLIVER * (sides**2).sum(axis=3).max(axis=2)).all(axis=1)
 
 
 def _clipped(loop: Floats) -> Ints:
@@ -169,7 +182,9 @@ def _clipped(loop: Floats) -> Ints:
     a, b, c = flat[faces].swapaxes(0, 1)
     u, v = b - a, c - a
     faces = np.where((u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] < 0)[:, None], faces[:, ::-1], faces)
-    return faces if len(faces) == n - 2 else np.vstack([faces, *_remainder(n, faces)])
+    if len(faces) != n - 2:
+        faces = np.vstack([faces, *_remainder(n, faces)])
+    return _fattened(flat, faces)
 
 
 def _remainder(n: int, faces: Ints) -> list[Ints]:
@@ -196,3 +211,47 @@ def _remainder(n: int, faces: Ints) -> list[Ints]:
                 loop.append(ahead)
             loops.append(fan_triangles(loop))
     return loops
+
+
+def _fattened(points: Floats, faces: Ints) -> Ints:
+    """Return triangles of a plane of which none is `THIN` that a flip of its longest side mends."""
+
+    def fatness(corners: tuple[int, ...]) -> float:
+        """Height over the longest side, over that side; negative if turned over."""
+        (ax, ay), (bx, by), (cx, cy) = (places[i] for i in corners)
+        longest = max((bx - ax) ** 2 + (by - ay) ** 2, (cx - bx) ** 2 + (cy - by) ** 2, (ax - cx) ** 2 + (ay - cy) ** 2)
+        return ((bx - ax) * (cy - ay) - (by - ay) * (cx - ax)) / max(longest, 1e-300)
+
+    a, b, c = points[faces].swapaxes(0, 1)
+    u, v = b - a, c - a
+    longest = np.max([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+    thin = np.flatnonzero(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] < THIN * longest).tolist()
+    if not thin:
+        return faces
+    places, made = points.tolist(), [tuple(face) for face in faces.tolist()]
+    owner = {(face[k], face[(k + 1) % 3]): t for t, face in enumerate(made) for k in range(3)}
+    if len(owner) != 3 * len(made):  # a polygon that crosses itself
+        return faces
+    for _ in range(8 * len(made)):
+        if not thin:
+            break
+        t = thin.pop()
+        if fatness(made[t]) >= THIN:
+            continue
+        sides = [(made[t][k], made[t][(k + 1) % 3], made[t][(k + 2) % 3]) for k in range(3)]
+        a, b, c = max(
+            sides, key=lambda side: sum((p - q) ** 2 for p, q in zip(places[side[0]], places[side[1]], strict=True))
+        )
+        other = owner.get((b, a))
+        if other is None:
+            continue
+        d = next(i for i in made[other] if i not in (a, b))
+        first, second = (c, a, d), (b, c, d)
+        if min(fatness(first), fatness(second)) <= min(fatness(made[t]), fatness(made[other])):
+            continue
+        del owner[a, b], owner[b, a]
+        for index, face in ((t, first), (other, second)):
+            made[index] = face
+            owner.update({(face[k], face[(k + 1) % 3]): index for k in range(3)})
+        thin += [t, other]
+    return np.array(made, np.int64)

@@ -22,6 +22,7 @@ CONVEX_TOLERANCE = 1e-6  # [R] how far a vertex may stand before a face's plane
 MOST_ROUNDING = 2e-6  # [R] coordinates rounded more coarsely than this cannot be told from a shape
 FEWEST_LEVELS = 8  # of coordinates along an axis that tell a grid from a few chosen values
 FEWEST_CORNERS = 64  # of a mesh whose coordinates are rounded rather than chosen
+MOST_SHELLS = 10_000  # each is compared with each
 SAME_ANGLE = 1e-6  # [rad] faces about an edge that are closer than this lie on each other
 MODELLER = "use a modeller (Blender: Edit Mode, Mesh > Clean Up)"
 
@@ -343,6 +344,9 @@ def _winding_number(corners: Floats, point: Floats) -> float:
 
 def outward(points: Floats, faces: Ints, shell: Ints, name: str, place: Any, notes: list[str]) -> tuple[Ints, int]:
     """Return the faces with normals towards the void, and the number of solids."""
+    if shell.max(initial=0) >= MOST_SHELLS:
+        fault = f"{shell.max() + 1} shells, more than the {MOST_SHELLS} that are told apart"
+        raise GrainError(f"{name}: {fault}; remove small parts")
     order = np.argsort(shell, kind="stable")
     groups = np.split(faces[order], np.cumsum(np.bincount(shell))[:-1])
     low = np.array([points[g].min(axis=(0, 1)) for g in groups])
@@ -413,7 +417,8 @@ def grid_step(points: Floats) -> float:
         Vertices, as the file has them.
     """
     largest = float(np.abs(points).max())
-    bits = 2.0**-23 if (points == points.astype(np.float32)).all() else 2.0**-52
+    with np.errstate(over="ignore"):  # what float32 cannot hold is not of float32
+        bits = 2.0**-23 if (points == points.astype(np.float32)).all() else 2.0**-52
     unsure = bits * 2.0 ** np.floor(np.log2(max(largest, 1e-300)))  # the last bit of the largest
     steps = [unsure if bits == 2.0**-23 else 0.0]
     for power in range(int(np.floor(np.log10(max(largest, 1e-300)))), -300, -1):
