@@ -74,7 +74,8 @@ class Grain:
     area, volume : float
         Surface area [R^2] and volume of the material [R^3], cavities' surface counted and their volume not.
     convex : bool
-        One body without cavities, locally convex at every edge within 1e-6 R, and as large as its hull.
+        One body of which no vertex stands further before the plane of a face than 1e-6 R and what the digits of the
+        file's coordinates explain; see `tsdf.surface.is_convex`.
     bodies : int
         Number of separate solids.
     notes : tuple of str
