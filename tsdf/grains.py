@@ -151,7 +151,7 @@ def load_grain(source: str | Path, repair: bool | Literal["any"] = False, **para
         nothing, none = np.empty((0, 3)), np.empty((0, 3), np.int32)
         area, volume = 4 * np.pi, 4 * np.pi / 3
         return Grain("sphere", name, {}, nothing, none, 1.0, area, volume, True, 1, (), digest)
-    if not os.path.exists(name.replace("\0", "")):
+    if not os.path.exists(name):
         raise GrainError(f"{name}: neither a file nor a built-in grain; built-in grains are {', '.join(BUILT_INS)}")
     vertices, faces = read_mesh(Path(source))
     return grain_from_mesh(vertices, faces, name=Path(source).name, repair=repair)

@@ -13,7 +13,7 @@ import stat
 import warnings
 import zipfile
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from tsdf.errors import GrainError
 from tsdf.gltf import read_gltf
-from tsdf.polygons import MOST_PIECES, Budget, Floats, Ints, Part, strip_triangles, triangle_part, triangles_of
+from tsdf.polygons import MOST_PIECES, Budget, Floats, Ints, Part, strips_part, triangle_part, triangles_of
 from tsdf.surface import equal_vertices
 from tsdf.vtk import numbers, read_vtk
 
@@ -97,12 +97,23 @@ def _check_kind(path: Path) -> None:
 # --------------------------------------------------------------------------------------------------- text
 
 
-def _lines(data: bytes, comment: str = "#") -> list[str]:
-    """Return the lines of a text file without comments; a comment may be in any encoding."""
-    text = data.decode("utf-8-sig", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
-    if comment not in text:
-        return text.splitlines()
-    return [line.partition(comment)[0] for line in text.splitlines()]
+def _lines(data: bytes) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number and the words of each line of a text file, without comments, which may be in any encoding.
+
+    A backslash at the end of a line goes on with the next.
+    """
+    words: list[str] = []
+    for number, line in enumerate(data.decode("utf-8-sig", errors="replace").splitlines(), 1):
+        text, comment, _ = line.partition("#")
+        words += text.split()
+        if words and not comment and words[-1].endswith("\\"):
+            words[-1] = words[-1][:-1]
+            continue
+        if words := [word for word in words if word]:
+            yield number, words
+        words = []
+    if words:
+        yield number, words
 
 
 def _positions(rows: list[list[str]], first: int = 0) -> Floats:
@@ -115,10 +126,7 @@ def _read_obj(data: bytes) -> list[Part]:
     places: list[list[str]] = []
     corners: list[int] = []
     sizes: list[int] = []
-    for number, line in enumerate(_lines(data), 1):
-        words = line.split()
-        if not words:
-            continue
+    for number, words in _lines(data):
         key = words[0]
         if key == "v":
             if len(words) < 4:
@@ -139,7 +147,7 @@ def _read_obj(data: bytes) -> list[Part]:
 
 def _read_off(data: bytes) -> list[Part]:
     """Vertices and faces of an OFF (also COFF, NOFF, STOFF), colours left out."""
-    rows = [words for line in _lines(data) if (words := line.split())]
+    rows = [words for _, words in _lines(data)]
     if rows and rows[0][0].endswith("OFF"):
         kind, *rest = rows[0]
         if "BINARY" in rest or kind.startswith(("4", "n")):
@@ -198,13 +206,16 @@ def _read_ply(data: bytes) -> list[Part]:
             case ["property", kind, name]:
                 elements[-1][2].append(Column(name, PLY_TYPES[kind]))
     text = numbers(body) if b"format ascii" in header else None
-    places, parts, at = np.empty((0, 3)), [], 0
+    places, at = np.empty((0, 3)), 0
+    faces: list[tuple[bool, Ints, Ints]] = []
     for name, rows, columns in elements:
         needed = rows * max(1, sum(1 if text is not None else np.dtype(c.length or c.kind).itemsize for c in columns))
         if not 0 <= needed <= (len(body) if text is None else len(text)) - at:
             raise ValueError(f"announces {rows} of {name} and holds fewer")
         if not columns:
             continue
+        if rows > Budget(len(data)).most and any(column.length for column in columns):
+            raise GrainError(f"announces {rows} of {name}, more than are read; simplify the mesh")
         if text is None:
             values, at = _binary_rows(body, at, rows, columns, order)
         else:
@@ -213,17 +224,19 @@ def _read_ply(data: bytes) -> list[Part]:
             places = np.column_stack([values[axis] for axis in "xyz"]).astype(np.float64)
         for key in ("vertex_indices", "vertex_index"):
             if name in ("face", "tristrips") and key in values:
-                corners, sizes = _whole(values[key][0]), values[key][1]
-                parts.append(_strips(places, corners, sizes) if name == "tristrips" else Part(places, corners, sizes))
+                faces.append((name == "tristrips", _whole(values[key][0]), values[key][1]))
+    parts = [
+        _strips(places, corners, sizes) if strips else Part(places, corners, sizes) for strips, corners, sizes in faces
+    ]
     return parts or [Part(places, np.empty(0, np.int64), np.empty(0, np.int64))]
 
 
 def _strips(places: Floats, corners: Ints, sizes: Ints) -> Part:
     """Return the triangles of strips that −1 ends."""
-    found = []
-    for row in np.split(corners, np.cumsum(sizes)[:-1]):
-        found += [strip_triangles(strip[strip >= 0]) for strip in np.split(row, np.flatnonzero(row < 0))]
-    return triangle_part(places, np.vstack(found))
+    rows = np.split(corners, np.cumsum(sizes)[:-1])
+    return strips_part(
+        places, [s[s >= 0] for row in rows for s in np.split(row, np.flatnonzero(row < 0)[:MOST_PIECES])]
+    )
 
 
 def _binary_rows(body: bytes, at: int, count: int, columns: list[Column], order: str) -> tuple[dict[str, Any], int]:
@@ -347,9 +360,8 @@ def _read_stl(data: bytes) -> list[Part]:
             raise ValueError(f"announces {count} facets and holds {max(0, len(data) - 84) // 50}")
         corners = np.frombuffer(data, STL_FACET, count, 84)["corners"].reshape(-1, 3).astype(np.float64)
     else:
-        words = data.lower().split()
-        at = [i for i, word in enumerate(words) if word == b"vertex"]
-        corners = np.array([words[i + 1 : i + 4] for i in at], np.float64).reshape(-1, 3)
+        words = re.findall(rb"^\s*vertex\s+(\S+)\s+(\S+)\s+(\S+)", data, re.MULTILINE | re.IGNORECASE)
+        corners = np.array(words, np.float64).reshape(-1, 3)
         if len(corners) % 3:
             raise ValueError("ends within a facet")
     used, index = np.unique(equal_vertices(corners), return_inverse=True)

@@ -15,6 +15,7 @@ from tsdf.errors import GrainError
 MOST_CORNERS = 5_000  # of one polygon: clipping ears takes up to their square
 MANY_FACES = 1_000_000  # more triangles than this only of a file with ten bytes for each
 MOST_PIECES = 100_000  # objects, primitives or nodes in a file
+MOST_CLIPPED = 100_000  # polygons that are neither triangles nor fans
 THIN = 0.02  # height of a triangle over its longest side below which another is looked for
 SLIVER = 1e-3  # the same of a fan or a quadrangle: with thinner ones ears are clipped instead
 
@@ -82,6 +83,19 @@ def strip_triangles(corners: ArrayLike) -> Ints:
     return faces
 
 
+def strips_part(points: ArrayLike, strips: list[Ints]) -> Part:
+    """Return the part of the triangles of strips.
+
+    Raises
+    ------
+    GrainError
+        There are more strips than `MOST_PIECES`.
+    """
+    if len(strips) > MOST_PIECES:
+        raise GrainError(f"is made of {len(strips)} strips, more than {MOST_PIECES}; export it as triangles")
+    return triangle_part(points, np.vstack([strip_triangles(strip) for strip in strips]))
+
+
 def fan_triangles(corners: ArrayLike) -> Ints:
     """Return (m, 3) the triangles of a fan about its first corner."""
     fan = np.asarray(corners, np.int64)
@@ -116,7 +130,9 @@ def triangles_of(part: Part) -> Ints:
     if sizes.max() > MOST_CORNERS:
         fault = f"face {int(sizes.argmax()) + 1} has {sizes.max()} corners, more than {MOST_CORNERS}"
         raise GrainError(f"{fault}; triangulate it in a modeller")
-    found, order = [], []
+    corners, sizes = _distinct(corners, sizes, starts)
+    starts = np.cumsum(sizes) - sizes
+    found, order, clipped = [], [], 0
     for size in np.unique(sizes[sizes >= 3]):
         which = np.flatnonzero(sizes == size)
         loops = corners[starts[which][:, None] + np.arange(size)]
@@ -133,12 +149,25 @@ def triangles_of(part: Part) -> Ints:
             bad[np.flatnonzero(bad)[good]] = False
         found.append(fan[~bad].reshape(-1, 3))
         order.append(np.repeat(which[~bad], size - 2))
+        clipped += int(bad.sum())
+        if clipped > MOST_CLIPPED:
+            raise GrainError(f"more than {MOST_CLIPPED} concave or degenerate polygons; triangulate it in a modeller")
         for i in np.flatnonzero(bad):
             found.append(loops[i][_clipped(points[loops[i]])])
             order.append(np.full(len(found[-1]), which[i]))
     if not found:
         return np.empty((0, 3), np.int64)
     return np.vstack(found)[np.argsort(np.concatenate(order), kind="stable")]
+
+
+def _distinct(corners: Ints, sizes: Ints, starts: Ints) -> tuple[Ints, Ints]:
+    """Return corners and sizes without corners that polygons of more than three name twice in a row."""
+    following = np.roll(corners, -1)
+    some = sizes > 0
+    following[(starts + sizes - 1)[some]] = corners[starts[some]]
+    polygon = np.repeat(np.arange(len(sizes)), sizes)
+    keep = (corners != following) | (sizes[polygon] <= 3)
+    return corners[keep], np.bincount(polygon[keep], minlength=len(sizes))
 
 
 def _fan(size: int) -> Ints:

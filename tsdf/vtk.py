@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsdf.errors import GrainError
-from tsdf.polygons import Floats, Ints, Part, strip_triangles, triangle_part
+from tsdf.polygons import Budget, Floats, Ints, Part, strips_part
 
-MOST_NUMBERS = 30_000_000  # of one array: a compressed one takes room that its bytes do not show
+MOST_NUMBERS = 9_000_000  # of one array, or one for each byte: a compressed one takes room that its bytes do not show
 # fmt: off
 LEGACY_TYPES = {
     "unsigned_char": "u1", "char": "i1", "unsigned_short": "u2", "short": "i2", "unsigned_int": "u4", "int": "i4",
@@ -89,8 +89,10 @@ def _part(points: Floats, corners: Ints, sizes: Ints, types: Ints | None = None)
 
 
 def _strips(points: Floats, corners: Ints, sizes: Ints) -> list[Part]:
-    found = [strip_triangles(strip) for strip in np.split(corners, np.cumsum(sizes)[:-1])] if len(sizes) else []
-    return [triangle_part(points, np.vstack(found))] if found else []
+    """Return the parts of triangle strips."""
+    if len(sizes) == 0 or sizes.min() < 0 or sizes.sum() != len(corners):
+        return _part(points, corners, sizes)  # none, or refused
+    return [strips_part(points, np.split(corners, np.cumsum(sizes)[:-1]))]
 
 
 # ------------------------------------------------------------------------------------------------- legacy
@@ -151,6 +153,8 @@ def _legacy(data: bytes) -> list[Part]:
         elif key == "POINTS":
             points = words.array(3 * int(head[1]), LEGACY_TYPES[head[2].lower()]).reshape(-1, 3).astype(np.float64)
         elif key in ("VERTICES", "LINES", "POLYGONS", "TRIANGLE_STRIPS", "CELLS"):
+            if int(head[1]) > Budget(len(data)).most:
+                raise GrainError(f"announces {head[1]} cells, more than are read; simplify the surface")
             corners, sizes = _legacy_cells(words, int(head[1]), int(head[2]))
             if key == "POLYGONS":
                 parts += _part(points, corners, sizes)
@@ -226,7 +230,7 @@ def _xml(data: bytes) -> list[Part]:
     root = ElementTree.fromstring(data)
     if root.tag != "VTKFile" or root.get("type") not in ("PolyData", "UnstructuredGrid"):
         raise GrainError(f"a data set of kind {root.get('type', root.tag)} has no surface; save it as .vtp or .stl")
-    arrays = _Arrays(root, appended, b"base64" in tag if mark else False)
+    arrays = _Arrays(root, appended, b"base64" in tag if mark else False, max(MOST_NUMBERS, len(data) + len(appended)))
     parts: list[Part] = []
     for piece in root.iter("Piece"):
         node = piece.find("Points/DataArray")
@@ -251,7 +255,8 @@ def _xml(data: bytes) -> list[Part]:
 class _Arrays:
     """The data arrays of an XML file."""
 
-    def __init__(self, root: ElementTree.Element, appended: bytes, base64_appended: bool) -> None:
+    def __init__(self, root: ElementTree.Element, appended: bytes, base64_appended: bool, most: int) -> None:
+        self._most = most
         self._order = ">" if root.get("byte_order") == "BigEndian" else "<"
         self._header = np.dtype(self._order + XML_TYPES[root.get("header_type", "UInt32")])
         self._appended, self._base64_appended = appended, base64_appended
@@ -267,8 +272,8 @@ class _Arrays:
 
     def of(self, node: ElementTree.Element, count: int) -> NDArray:
         """Return the `count` numbers of a DataArray."""
-        if not 0 <= count <= MOST_NUMBERS:
-            raise ValueError(f"an array of {count} numbers")
+        if not 0 <= count <= self._most:
+            raise GrainError(f"announces an array of {count} numbers, more than {self._most}; save it as .stl or .ply")
         kind = np.dtype(self._order + XML_TYPES[node.attrib["type"]])
         form, size = node.get("format", "ascii"), count * kind.itemsize
         if form == "ascii":
