@@ -16,7 +16,7 @@ from array import array
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
-from xml.etree import ElementTree
+from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -416,67 +416,61 @@ def _read_3mf(data: bytes) -> list[Part]:
 def _read_model(stream: Any, file: str, objects: dict, most: int) -> list[tuple[str, str, Floats]]:
     """Add the objects of one model of a 3MF to `objects` and return its build items: file, object, matrix (4, 3)."""
 
-    def local(name: str) -> str:
-        return name.rpartition("}")[2]
-
-    def target(element: ElementTree.Element) -> tuple[str, str, Floats]:
-        elsewhere = next((value for key, value in element.attrib.items() if local(key) == "path"), file)
-        words = element.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").split()
-        return "/" + elsewhere.lstrip("/").lower(), element.attrib["objectid"], np.array(words, float).reshape(4, 3)
+    def target(attributes: dict[str, str]) -> tuple[str, str, Floats]:
+        elsewhere = next((value for key, value in attributes.items() if key.rpartition("}")[2] == "path"), file)
+        words = attributes.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").split()
+        return "/" + elsewhere.lstrip("/").lower(), attributes["objectid"], np.array(words, float).reshape(4, 3)
 
     items, components = [], []
     points, faces = array("d"), array("q")
     spaces: dict[str, str] = {}
-    mesh: Part | None = None
-    stack: list[ElementTree.Element] = []
-    for event, element in ElementTree.iterparse(_NoEntities(stream), ("start-ns", "start", "end")):
-        if event == "start-ns":
-            spaces[element[0]] = element[1]
-            continue
-        name = local(element.tag)
-        if event == "start":
-            stack.append(element)
-            if name == "model":
-                for prefix in element.get("requiredextensions", "").split():
-                    if spaces.get(prefix) not in MAY_REQUIRE:
-                        raise GrainError(f"needs the extension {spaces.get(prefix, prefix)}; {WAY_OUT}")
-            elif name in SHAPES:
-                raise GrainError(f"holds a {name}, which is not read; {WAY_OUT}")
-            continue
+    meshes: list[Part] = []
+    identity = ""
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal identity
+        name = tag.rpartition("}")[2]
         if name == "vertex":
-            points.extend(float(element.attrib[axis]) for axis in "xyz")
+            points.append(float(attributes["x"]))
+            points.append(float(attributes["y"]))
+            points.append(float(attributes["z"]))
         elif name == "triangle":
-            faces.extend(int(element.attrib[corner]) for corner in ("v1", "v2", "v3"))
-        elif name == "mesh":
-            mesh = triangle_part(np.array(points).reshape(-1, 3), np.array(faces).reshape(-1, 3))
-            points, faces = array("d"), array("q")
-        elif name == "component":
-            components.append(target(element))
+            faces.append(int(attributes["v1"]))
+            faces.append(int(attributes["v2"]))
+            faces.append(int(attributes["v3"]))
         elif name == "object":
-            objects[file, element.attrib["id"]] = (mesh, components)
-            mesh, components = None, []
+            identity = attributes["id"]
+        elif name == "component":
+            components.append(target(attributes))
         elif name == "item":
-            items.append(target(element))
-        stack.pop()
-        if stack:
-            stack[-1].remove(element)  # what has been read leaves the tree
-        if len(points) > 9 * most or len(faces) > 3 * most:
+            items.append(target(attributes))
+        elif name == "model":
+            for prefix in attributes.get("requiredextensions", "").split():
+                if spaces.get(prefix) not in MAY_REQUIRE:
+                    raise GrainError(f"needs the extension {spaces.get(prefix, prefix)}; {WAY_OUT}")
+        elif name in SHAPES:
+            raise GrainError(f"holds a {name}, which is not read; {WAY_OUT}")
+        if len(points) > 6 * most or len(faces) > 3 * most:
             raise GrainError(f"a mesh of more than {most} triangles; simplify it, or export it as PLY or STL")
+
+    def end(tag: str) -> None:
+        name = tag.rpartition("}")[2]
+        if name == "mesh":
+            meshes.append(triangle_part(np.array(points).reshape(-1, 3), np.array(faces).reshape(-1, 3)))
+            del points[:], faces[:]
+        elif name == "object":
+            objects[file, identity] = (meshes[0] if meshes else None, list(components))
+            del meshes[:], components[:]
+
+    def doctype(*_: Any) -> None:
+        raise GrainError(f"its XML declares a document type; {WAY_OUT}")
+
+    parser = expat.ParserCreate(namespace_separator="}")
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.StartDoctypeDeclHandler = doctype
+    parser.StartNamespaceDeclHandler = lambda prefix, space: spaces.update({prefix: space})
+    parser.ParseFile(stream)
     return items
-
-
-class _NoEntities:
-    """A stream of XML that may not define entities."""
-
-    def __init__(self, stream: Any) -> None:
-        self._stream = stream
-        self._tail = b""
-
-    def read(self, size: int = -1) -> bytes:
-        block = self._stream.read(size)
-        check_xml(self._tail + block)
-        self._tail = block[-16:]
-        return block
 
 
 def check_xml(data: bytes) -> None:
