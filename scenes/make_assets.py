@@ -3,7 +3,8 @@
     python scenes/make_assets.py
 
 Meshes are closed, manifold and stand on z = 0; the boundaries of media have one sheet above each point of the floor, so
-they cannot cross themselves. Skies are latitude-longitude images, row 0 the zenith, columns from +x toward +y.
+they cannot cross themselves. Skies are latitude-longitude images as `tsdf.lights` has them: row 0 is the zenith, the
+middle of the width +x, left of it +y.
 """
 
 import sys
@@ -112,7 +113,7 @@ def bead_pile() -> tuple[Array, Array]:
 def directions(height: int) -> tuple[Array, Array, Array]:
     """Return x, y, z of the middles of the pixels of an image of 2 height columns."""
     polar = np.pi * (np.arange(height)[:, None] + 0.5) / height
-    azimuth = np.pi * (np.arange(2 * height) + 0.5) / height
+    azimuth = np.pi - np.pi * (np.arange(2 * height) + 0.5) / height
     return np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar) * np.ones(2 * height)
 
 

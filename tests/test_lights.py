@@ -172,7 +172,7 @@ def quadrature(n, constant, environment, rotation_deg, suns, fine=60):
     height, width = environment.shape[:2]
     polar = np.linspace(0.0, math.pi, height * fine + 1)
     mid = 0.5 * (polar[1:] + polar[:-1])
-    azimuth = (np.arange(width * fine) + 0.5) / (width * fine) * 2.0 * math.pi + math.radians(rotation_deg)
+    azimuth = math.pi - (np.arange(width * fine) + 0.5) / (width * fine) * 2.0 * math.pi + math.radians(rotation_deg)
     x = np.sin(mid)[:, None] * np.cos(azimuth)
     y = np.sin(mid)[:, None] * np.sin(azimuth)
     cosine = np.maximum(n[0] * x + n[1] * y + n[2] * np.cos(mid)[:, None], 0.0)
@@ -246,11 +246,44 @@ def toward(polar_deg, azimuth_deg):
     return math.sin(p) * math.cos(a), math.sin(p) * math.sin(a), math.cos(p)
 
 
+def latlong(x, y, z, width, height):
+    """Return column and row of a direction by ImfEnvmap.h (LatLongMap), in pixels from the left and upper edge.
+
+    Its world is y-up: latitude is the angle to the plane y = 0, longitude is 0 along +z and 90 degrees along +x; the
+    image goes from longitude +pi at the left to -pi, from latitude +pi/2 at the top to -pi/2.
+    """
+    latitude = math.atan2(y, math.hypot(x, z))
+    longitude = math.atan2(x, z)
+    return (0.5 - longitude / (2.0 * math.pi)) * width, (0.5 - latitude / math.pi) * height
+
+
+def test_columns_are_those_of_openexr():
+    """Each direction finds the pixel that the definition of OpenEXR gives, whose z, x, y are our x, y, z.
+
+    Pixels there are constant, so that those within 1e-6 of an edge are left out. Negative control: columns that run the
+    other way, as a mirror image has them.
+    """
+    height, width = 6, 14
+    pixels = 1.0 + np.arange(height * width * 3.0).reshape(height, width, 3)
+    lights = compile_lights(environment=pixels)
+    ways = np.random.default_rng(8).normal(size=(2000, 3))
+    wrong = mirrored = 0
+    for x, y, z in ways / np.linalg.norm(ways, axis=1, keepdims=True):
+        column, row = latlong(y, z, x, width, height)
+        if min(column % 1.0, -column % 1.0, row % 1.0, -row % 1.0) > 1e-6:
+            found = radiance(lights, (x, y, z), -1.0)
+            wrong += found != tuple(pixels[int(row), int(column)])
+            mirrored += found == tuple(pixels[int(row), width - 1 - int(column)])
+    assert wrong == 0
+    assert mirrored < 200
+
+
 @pytest.mark.parametrize("rotation_deg", [0.0, 30.0, -30.0, 300.0, 765.0])
 def test_where_a_pixel_is(rotation_deg):
-    """One bright pixel, row 1 of 4 and column 1 of 8: polar angle 45 to 90, azimuth 45 to 90 degrees from +x to +y.
+    """One bright pixel, row 1 of 4 and column 1 of 8: polar angle 45 to 90, azimuth 90 to 135 degrees from +x to +y.
 
-    Looked at from inside and outside of each edge, and every draw lies in it; the mirror images are dark.
+    A rotation adds to the azimuth. Looked at from inside and outside of each edge, and every draw lies in it; mirror
+    images are dark.
     """
     pixels = np.zeros((4, 8, 3))
     pixels[1, 1] = 1e6, 2e6, 3e6
@@ -259,14 +292,14 @@ def test_where_a_pixel_is(rotation_deg):
     def bright(polar_deg, azimuth_deg):
         return radiance(lights, toward(polar_deg, azimuth_deg + rotation_deg), -1.0) == (1e6, 2e6, 3e6)
 
-    assert bright(67.5, 67.5) and bright(46, 46) and bright(89, 89) and bright(46, 89) and bright(89, 46)
-    assert not any(bright(*at) for at in [(44, 67), (91, 67), (67, 44), (67, 91)])
-    assert not any(bright(*at) for at in [(112.5, 67.5), (67.5, -67.5), (67.5, 22.5), (67.5, 247.5)])
+    assert bright(67.5, 112.5) and bright(46, 91) and bright(89, 134) and bright(46, 134) and bright(89, 91)
+    assert not any(bright(*at) for at in [(44, 112), (91, 112), (67, 89), (67, 136)])
+    assert not any(bright(*at) for at in [(112.5, 112.5), (67.5, -112.5), (67.5, 67.5), (67.5, 292.5)])
     solid_angle = math.cos(math.radians(45)) * math.pi / 4
     for u in np.random.default_rng(6).random((1000, 3)):
         d, p, rgb = draw(lights, *u)
         azimuth = (math.degrees(math.atan2(d[1], d[0])) - rotation_deg) % 360.0
-        assert 45.0 <= math.degrees(math.acos(d[2])) <= 90.0 and 45.0 <= azimuth <= 90.0
+        assert 45.0 <= math.degrees(math.acos(d[2])) <= 90.0 and 90.0 <= azimuth <= 135.0
         assert p == pytest.approx(1.0 / solid_angle) and rgb == (1e6, 2e6, 3e6)
 
 

@@ -13,6 +13,7 @@ from scenes.plate import plate
 from scenes.side_by_side import difference, side_by_side
 from tsdf import image, render, scene, world
 from tsdf.grains import load_grain, read_mesh
+from tsdf.lights import compile_lights, radiance
 from tsdf.optics import Optics
 from tsdf.scatterometer import Effort, exact_sphere
 
@@ -94,6 +95,22 @@ def test_one_ball_lies_under_the_snow_and_one_half_in_it(assets):
     balls = {surface.name: cover(surface) for surface in loaded("snow", assets, 8).surfaces if "ball" in surface.name}
     assert 0.002 < balls["blue ball"] < 0.006
     assert balls["red ball"] < -0.02
+
+
+def test_skies_stand_as_the_scenes_are_lit(assets):
+    """The evening's warm side is -x, where the sun of sand.toml is; the studio's window is on the left of the camera
+    that looks along +y, its warm strip on the right: by the directions that the renderer looks in."""
+
+    def red_less_blue(name, *azimuths_deg):
+        lights = compile_lights(environment=image.read_exr(assets / "assets" / f"{name}.exr").rgb)
+        ways = [(np.cos(a), np.sin(a), 0.7) for a in np.radians(azimuths_deg)]
+        seen = [radiance(lights, tuple(np.array(way) / np.linalg.norm(way)), -1.0) for way in ways]
+        return [r - b for r, _, b in seen]
+
+    west, east = red_less_blue("evening_sky", 180.0, 0.0)
+    assert west > east
+    window, strip = red_less_blue("studio", 115.0, -40.0)
+    assert window < -1.0 and strip > 1.0
 
 
 def test_assets_are_the_same_every_time(assets, tmp_path):

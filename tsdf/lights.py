@@ -1,8 +1,10 @@
 """Light from infinity: a constant, an environment in latitude and longitude, suns.
 
 z is up. A `direction` is a unit triple that points toward the light, the way a camera ray travels on leaving the
-scene. Row 0 of an environment is the zenith (+z), its last row the nadir; its columns begin at azimuth 0 (+x) and go
-toward +y (azimuth 90 degrees at a quarter of the width); `rotation_deg` adds to the azimuth. Pixels are constant.
+scene; its azimuth runs counter-clockwise seen from above, from +x over +y. Row 0 of an environment is the zenith (+z),
+its last row the nadir. Columns are longitudes as in OpenEXR's ImfEnvmap.h, whose z, x, y are our x, y, z: azimuth falls
+from 180 degrees at the left edge to -180 at the right, so that the middle looks along +x with +y to its left (Blender's
+and three.js's place, too). `rotation_deg` adds to the azimuth. Pixels are constant.
 
 Suns are drawn in proportion to the luminance they send, the environment to that above a multiple of its mean; the
 density is the sum of both over their power, whatever overlaps. The constant is never drawn. Reading image files is
@@ -33,7 +35,7 @@ class LightArrays(NamedTuple):
 
     constant: tuple[float, float, float]  # radiance
     environment: np.ndarray  # (h, w, 3) radiance, h = 0 where there is none
-    rotation: float  # [turns] azimuth of the left edge of column 0
+    rotation: float  # [turns] azimuth of the left edge of column 0, which falls from there
     cos_edges: np.ndarray  # (h + 1,) cosine of the polar angle of the rows' edges, from 1 to -1
     aim: np.ndarray  # (h, w) by how much each pixel is aimed at [luminance]
     rows: np.ndarray  # (h,) running sum of `aim` times cosine difference
@@ -62,7 +64,8 @@ def compile_lights(
     environment : (h, w, 3) float, optional
         Radiance of the pixels, >= 0; it adds to the constant.
     rotation_deg : float
-        Azimuth of the left edge of column 0 of the environment [degrees], from +x toward +y.
+        By how much the environment is turned about +z, counter-clockwise seen from above [degrees]: the azimuth of
+        the middle of its width.
     suns : sequence of (direction, angular_diameter_deg, irradiance)
         Discs of uniform radiance: a vector toward the centre, of any length; the diameter [degrees], in [1e-6, 180];
         the linear-sRGB irradiance on a surface that faces it, >= 0.
@@ -104,7 +107,7 @@ def compile_lights(
     return LightArrays(
         constant=(float(everywhere[0]), float(everywhere[1]), float(everywhere[2])),
         environment=pixels,
-        rotation=math.fmod(rotation_deg, 360.0) / 360.0,
+        rotation=0.5 + math.fmod(rotation_deg, 360.0) / 360.0,
         cos_edges=cos_edges,
         aim=aim,
         rows=rows,
@@ -160,9 +163,9 @@ def _sent(lights, direction):
     height = lights.environment.shape[0]
     if height > 0:
         width = lights.environment.shape[1]
-        azimuth = math.atan2(y, x) / (2.0 * math.pi) - lights.rotation
+        along = lights.rotation - math.atan2(y, x) / (2.0 * math.pi)
         row = max(0, min(height - 1, int(math.atan2(math.sqrt(x * x + y * y), z) / math.pi * height)))
-        column = max(0, min(width - 1, int((azimuth - math.floor(azimuth)) * width)))
+        column = max(0, min(width - 1, int((along - math.floor(along)) * width)))
         r = lights.environment[row, column, 0]
         g = lights.environment[row, column, 1]
         b = lights.environment[row, column, 2]
@@ -238,7 +241,7 @@ def draw(lights, u0, u1, u2):
         row, down = _cell(lights.rows, u1 * lights.rows[-1])
         column, along = _cell(lights.columns[row], u2 * lights.columns[row, -1])
         z = lights.cos_edges[row] + down * (lights.cos_edges[row + 1] - lights.cos_edges[row])
-        azimuth = (column + along) / lights.columns.shape[1] + lights.rotation
+        azimuth = lights.rotation - (column + along) / lights.columns.shape[1]
         c, s = turn(azimuth - math.floor(azimuth))
         rho = math.sqrt(max(0.0, 1.0 - z * z))
         direction = (rho * c, rho * s, z)

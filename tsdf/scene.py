@@ -69,11 +69,11 @@ class ConstantLight:
 
 @dataclass(frozen=True)
 class EnvironmentLight:
-    """Radiance from a picture of all directions."""
+    """Radiance from a picture of all directions; its middle lies along +x, with +y to its left."""
 
     file: Path
     scale: float = 1.0
-    rotation_deg: float = 0.0  # about the z axis [deg]
+    rotation_deg: float = 0.0  # about +z, counter-clockwise seen from above [deg]
 
 
 @dataclass(frozen=True)
