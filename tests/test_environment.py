@@ -37,3 +37,13 @@ def test_left_in_the_image_is_left_in_the_picture(tmp_path, target, rotation_deg
     picture = render.render(looking(tmp_path, pixels, target, rotation_deg), spp=1).rgb
     assert (picture[:, :18] == left).all()
     assert (picture[:, 22:] == right).all()
+
+
+def test_what_was_mended_is_said_by_the_world(tmp_path):
+    """The notes of the image are notes of the scene, which tsdf-render shows; the picture has the mended light."""
+    pixels = np.full((4, 8, 3), 0.25)
+    pixels[1, 4, 0] = -1e-7
+    made = looking(tmp_path, pixels)
+    assert sum("sky.exr: 1 pixel is negative" in note for note in made.notes) == 1
+    assert render.render(made, spp=1).rgb.min() == 0.0
+    assert not looking(tmp_path, np.abs(pixels)).notes

@@ -1,7 +1,8 @@
 """Images: what is written is what is read, what cannot be meant is refused, colours agree with colour-science."""
 
+import base64
 import math
-import re
+import os
 import subprocess
 import sys
 import warnings
@@ -109,6 +110,77 @@ def test_reads_luminance_and_the_second_part(tmp_path):
     assert np.array_equal(read_exr(tmp_path / "parts.exr").rgb, rgb)
 
 
+MIP = (  # 8 by 4 halves 0, 1/64, 2/64 ..., with its smaller levels; made by OpenImageIO's make_texture
+    "di8xAQICAABjYXBEYXRlAHN0cmluZwATAAAAMjAyNjoxMToyNiAwNzoxNjozMmNoYW5uZWxzAGNobGlzdAA3AAAAQgABAAAAAAAAAAEAAAAB"
+    "AAAARwABAAAAAAAAAAEAAAABAAAAUgABAAAAAAAAAAEAAAABAAAAAGNvbXByZXNzaW9uAGNvbXByZXNzaW9uAAEAAAADZGF0YVdpbmRvdwBi"
+    "b3gyaQAQAAAAAAAAAAAAAAAHAAAAAwAAAGRpc3BsYXlXaW5kb3cAYm94MmkAEAAAAAAAAAAAAAAABwAAAAMAAABmb3Zjb3QAZmxvYXQABAAA"
+    "AAAAAEBsaW5lT3JkZXIAbGluZU9yZGVyAAEAAAAAb2lpbzpBdmVyYWdlQ29sb3IAc3RyaW5nABoAAAAwLjcyNjU2MiwwLjc0MjE4OCwwLjc1"
+    "NzgxMm9paW86U0hBLTEAc3RyaW5nACgAAAA0QzZFQjVENkM3QjdEOEI0OUJERkJBQjYxREU3QTk4NjRDNUYyOUVCcGl4ZWxBc3BlY3RSYXRp"
+    "bwBmbG9hdAAEAAAAAACAP3NjcmVlbldpbmRvd0NlbnRlcgB2MmYACAAAAAAAAAAAAAAAc2NyZWVuV2luZG93V2lkdGgAZmxvYXQABAAAAAAA"
+    "gD90ZXh0dXJlZm9ybWF0AHN0cmluZwANAAAAUGxhaW4gVGV4dHVyZXRpbGVzAHRpbGVkZXNjAAkAAABAAAAAQAAAAAF3cmFwbW9kZXMAc3Ry"
+    "aW5nAAsAAABibGFjayxibGFjawBrAgAAAAAAAOkCAAAAAAAALQMAAAAAAABNAwAAAAAAAAAAAAAAAAAAAAAAAAAAAABqAAAAeF5dibEVgDAI"
+    "RBklIzgCvcM4gXok+p6zWDFCRrC0zCgC0cZ7B587CCCqzBV+MJODwFa1kFUOy8kZ61Id4qkauVW1KpR+vPciWQTTUbJkyHhu2bILMM9i24le"
+    "RDAvPXS6Y4D1PT4+I9lnvgAAAAAAAAAAAQAAAAEAAAAwAAAAwDNgNeA2MDhAMyA1oDYQOMAy4DRgNuA38DtYPLg8GD3QO0g8qDwIPbA7ODyY"
+    "PPg8AAAAAAAAAAACAAAAAgAAAAwAAABQOdA6MDmwOhA5kDoAAAAAAAAAAAMAAAADAAAABgAAABA68DnQOQ=="
+)  # fmt: skip
+
+
+def test_reads_the_finest_level_of_a_mip_map(tmp_path):
+    (tmp_path / "mip.exr").write_bytes(base64.b64decode(MIP))
+    expected = np.arange(4 * 8 * 3).reshape(4, 8, 3) / 64
+    assert np.array_equal(read_exr(tmp_path / "mip.exr").rgb, expected)
+
+
+def test_reads_the_only_layer_of_colour(tmp_path):
+    """Blender's names: one layer beside depth is taken, plain channels come before layers, two layers are refused."""
+    rgb = random_image()
+
+    def layer(name):
+        return {f"{name}{c}": rgb[..., i] for i, c in enumerate("RGB")}
+
+    only = written(tmp_path / "only.exr", layer("ViewLayer.Combined.") | {"ViewLayer.Depth.Z": rgb[..., 0]})
+    assert np.array_equal(read_exr(only).rgb, rgb)
+    plain = written(tmp_path / "plain.exr", layer("diffuse.") | {c: 2.0 * rgb[..., i] for i, c in enumerate("RGB")})
+    assert np.array_equal(read_exr(plain).rgb, 2.0 * rgb)
+    with pytest.raises(TSDFError, match=r"no plain channels R, G, B, but 2 layers \(diffuse, specular\); save the one"):
+        read_exr(written(tmp_path / "two.exr", layer("diffuse.") | layer("specular.")))
+
+
+def deep(dtype=np.float32):
+    pixels = np.empty((4, 8), dtype=object)
+    for place in np.ndindex(pixels.shape):
+        pixels[place] = np.ones(2, dtype)
+    return pixels
+
+
+def test_what_is_not_read_is_called_by_its_name(tmp_path):
+    """Deep pixels, CIE XYZ, luminance and chroma, subsampled colour: each is refused for what it is."""
+    import Imath
+
+    def thinned(name, **step):
+        header = OpenEXR.Header(8, 4)
+        kind = Imath.PixelType(Imath.PixelType.FLOAT)
+        header["channels"] = {c: Imath.Channel(kind, n, n) for c, n in step.items()}
+        file = OpenEXR.OutputFile(str(tmp_path / name), header)
+        file.writePixels({c: np.ones((4 // n, 8 // n), np.float32).tobytes() for c, n in step.items()})
+        file.close()
+
+    zips = OpenEXR.ZIPS_COMPRESSION
+    written(tmp_path / "deep.exr", dict.fromkeys("RGBAZ", deep()), type=OpenEXR.deepscanline, compression=zips)
+    written(tmp_path / "xyz.exr", dict.fromkeys("XYZ", random_image()[..., 0]))
+    thinned("chroma.exr", Y=1, RY=2, BY=2)
+    thinned("thin.exr", R=1, G=1, B=2)
+    for name, says in [
+        ("deep.exr", "its pixels are deep .*; flatten it"),
+        ("xyz.exr", "its channels X, Y, Z are of CIE XYZ; save"),
+        ("chroma.exr", r"it has luminance and chroma \(Y, RY, BY\); save"),
+        ("thin.exr", "its channel B is subsampled; save"),
+    ]:
+        with pytest.raises(TSDFError, match=says) as caught:
+            read_exr(tmp_path / name)
+        assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize(("x", "y"), [(0, 0), (-3, -2), (5, 7), (-40, 0), (60, -90)])
 def test_the_display_window_is_read(tmp_path, x, y):
     """Crops and overscan: the data window begins at (x, y) of a display of 20 by 10; compared pixel by pixel."""
@@ -139,10 +211,16 @@ def test_truncated_files_are_refused(tmp_path):
 def test_what_is_no_image_is_refused(tmp_path):
     """One line that names the file and the way out."""
     (tmp_path / "text.exr").write_text("hello")
+    (tmp_path / "sky.hdr").write_text("#?RADIANCE\n")
+    write_png(tmp_path / "sky.png", random_image())
+    os.mkfifo(tmp_path / "pipe")
     written(tmp_path / "depth.exr", {"Z": random_image()[..., 0]})
     for name, says in [
         ("none.exr", "No such file.*check the name"),
-        (".", "Is a directory.*check"),
+        (".", "is not a regular file; name"),
+        ("pipe", "is not a regular file; name"),
+        ("sky.hdr", "is not an OpenEXR file .*but Radiance HDR; save it as OpenEXR"),
+        ("sky.png", "is not an OpenEXR file .*but PNG; save it as OpenEXR"),
         ("nul\0.exr", "null byte"),
         ("text.exr", "not an OpenEXR file"),
         ("depth.exr", "no full-size channels R, G, B or Y, but Z; save"),
@@ -189,23 +267,129 @@ def test_bad_arguments_of_write(tmp_path):
 # -------------------------------------------------------------------------------------- environments
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -1e-3])
-def test_environment_pixels_are_checked(tmp_path, bad):
-    """A bad pixel is named by its place; a good image returns as float64."""
-    rgb = np.abs(random_image())
-    write_exr(tmp_path / "sky.exr", rgb)
+def sky_with(path, change, dtype=np.float32):
+    """Write an environment of values from 0.1 to 1.1, changed, and return it as written."""
+    rgb = (0.1 + np.random.default_rng(3).random((8, 16, 3))).astype(dtype)
+    change(rgb)
+    return rgb, written(path, {c: rgb[..., i] for i, c in enumerate("RGB")})
+
+
+def test_a_good_environment_is_as_it_is(tmp_path):
+    """Float64, every value as written, and nothing to say."""
+    rgb, path = sky_with(tmp_path / "sky.exr", lambda rgb: None)
+    sky = read_environment(path)
+    assert sky.radiance.dtype == np.float64 and np.array_equal(sky.radiance, rgb)
+    assert sky.notes == ()
+
+
+def put(value, *places):
+    def change(rgb):
+        for place in places:
+            rgb[place] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "dtype", "mended", "says"),
+    [
+        (put(-1e-7, (3, 5, 1)), "f4", 0.0, "1 pixel is negative, down to -1e-07, "),
+        (put(-2.0, (3, 5, 1), (0, 0, 0), (0, 0, 2)), "f4", 0.0, "2 pixels are negative, down to -2, "),
+        (put(-np.inf, (3, 5, 1)), "f4", 0.0, "1 pixel is negative, down to -inf, "),
+        (put(np.inf, (3, 5, 1), (7, 15, 0)), "f2", 65504.0, "2 pixels are infinite: taken as 65504"),
+        (put(np.inf, (3, 5, 1)), "f4", 65504.0, "1 pixel is infinite: taken as 65504"),
+        (put(np.nan, (3, 5, 1)), "f4", 0.0, "1 pixel is not a number: taken as 0"),
+    ],
+)
+def test_pixels_that_are_no_radiance_are_mended(tmp_path, change, dtype, mended, says):
+    """Each such number, and no other, becomes what the note says; the note names the file and how many."""
+    rgb, path = sky_with(tmp_path / "sky.exr", change, dtype)
+    sky = read_environment(path)
+    good = np.isfinite(rgb) & (rgb >= 0.0)
+    assert np.array_equal(sky.radiance[good], rgb[good].astype(np.float64))
+    assert (~good).any() and (sky.radiance[~good] == mended).all()
+    (note,) = sky.notes
+    assert note.startswith(f"{path}: {says}") and "\n" not in note
+
+
+def test_how_much_is_negative_is_said(tmp_path):
+    """The sum of what is negative over the sum of what is not, here -0.5 over 25; an infinite number counts as the
+    largest that is finite."""
+    pixels = np.zeros((2, 4, 3))
+    pixels[0], pixels[1, 0, 0], pixels[1, 1] = 1.0, -0.5, (1.0, 6.0, 6.0)
+    write_exr(tmp_path / "sky.exr", pixels)
+    assert read_environment(tmp_path / "sky.exr").notes[0].endswith("down to -0.5, 2 % of the sum of all: taken as 0")
+    pixels[1, 0, 0], pixels[1, 1, 1] = np.inf, 1e6
+    write_exr(tmp_path / "sky.exr", pixels)
     sky = read_environment(tmp_path / "sky.exr")
-    assert sky.dtype == np.float64 and np.array_equal(sky, rgb)
-    rgb[3, 5, 1] = bad
-    write_exr(tmp_path / "sky.exr", rgb)
-    with pytest.raises(TSDFError, match=re.escape(f"row 3, column 5 (from 0 at the top left) has G = {bad:g}")):
-        read_environment(tmp_path / "sky.exr")
+    assert sky.notes[0].endswith("1 pixel is infinite: taken as 1e+06") and sky.radiance[1, 0, 0] == 1e6
 
 
-def test_black_environment_is_refused(tmp_path):
-    write_exr(tmp_path / "sky.exr", np.zeros((4, 8, 3)))
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
+def test_black_environment_is_refused(tmp_path, value):
+    write_exr(tmp_path / "sky.exr", np.full((4, 8, 3), value))
     with pytest.raises(TSDFError, match="every pixel is black"):
         read_environment(tmp_path / "sky.exr")
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "noted"),
+    [(5, 10, False), (5, 1, False), (1, 2, False), (100, 60, True), (9, 12, True), (8, 15, True)],
+)
+def test_shapes_that_are_no_panorama_are_noted(tmp_path, height, width, noted):
+    """Photographs, upright or not, are taken with a note; twice as wide as high, or one column, without."""
+    write_exr(tmp_path / "sky.exr", np.ones((height, width, 3)))
+    notes = read_environment(tmp_path / "sky.exr").notes
+    assert [f"{width} x {height} pixels, not twice as wide as high" in note for note in notes] == [True] * noted
+
+
+def test_cube_maps_are_refused_by_their_attribute(tmp_path):
+    """The attribute envmap says cube; one that says latitude-longitude is taken."""
+    channels = {c: np.ones((48, 8), np.float32) for c in "RGB"}
+    with pytest.raises(TSDFError, match="a cube map by its attribute envmap; convert"):
+        read_environment(written(tmp_path / "cube.exr", channels, envmap=OpenEXR.ENVMAP_CUBE))
+    channels = {c: np.ones((4, 8), np.float32) for c in "RGB"}
+    assert not read_environment(written(tmp_path / "sky.exr", channels, envmap=OpenEXR.ENVMAP_LATLONG)).notes
+
+
+def test_a_cropped_environment_is_noted(tmp_path):
+    """The display window is all directions; what the data window leaves out is black, and a note says so."""
+    rgb = np.ones((4, 8), np.float32)
+    display = (np.array([0, 0], np.int32), np.array([15, 7], np.int32))
+    data = (np.array([4, 2], np.int32), np.array([11, 5], np.int32))
+    path = written(tmp_path / "sky.exr", dict.fromkeys("RGB", rgb), dataWindow=data, displayWindow=display)
+    sky = read_environment(path)
+    assert sky.radiance.shape == (8, 16, 3) and sky.radiance.sum() == 3 * rgb.sum()
+    assert "data window" in sky.notes[0]
+
+
+def test_other_primaries_are_converted(tmp_path):
+    """ACES AP0 by its attribute chromaticities: the colour that sRGB calls (0.2, 0.5, 0.1), by way of colour-science's
+    own ACES; white stays white, and primaries of sRGB itself are no news. Primaries on one line are noted."""
+    aces, srgb = colour.RGB_COLOURSPACES["ACES2065-1"], colour.RGB_COLOURSPACES["sRGB"]
+    wanted = np.array([0.2, 0.5, 0.1])
+    rgb = np.ones((4, 8, 3))
+    rgb[1, 2] = colour.RGB_to_RGB(wanted, srgb, aces, "Bradford")
+    channels = {c: rgb[..., i].astype(np.float32) for i, c in enumerate("RGB")}
+
+    def read(*chromaticities):
+        return read_environment(written(tmp_path / "sky.exr", channels, chromaticities=chromaticities))
+
+    sky = read(*aces.primaries.ravel(), *aces.whitepoint)
+    assert np.abs(sky.radiance[1, 2] - wanted).max() < 2e-4
+    assert np.abs(sky.radiance[0] - 1.0).max() < 2e-4
+    assert "primaries" in sky.notes[0] and len(sky.notes) == 1
+    sky = read(*srgb.primaries.ravel(), *srgb.whitepoint)
+    assert np.array_equal(sky.radiance, rgb.astype(np.float32)) and not sky.notes
+    assert "makes no sense" in read(0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3).notes[0]
+
+
+def test_small_files_of_many_pixels_are_refused_before_they_are_read(tmp_path):
+    """A black image of 8192 x 4096 pixels is a small file that would take gigabytes as an environment."""
+    path = written(tmp_path / "sky.exr", dict.fromkeys("RGB", np.zeros((4096, 8192), np.float16)))
+    assert path.stat().st_size < 1e6
+    with pytest.raises(TSDFError, match=r"8192 x 4096 pixels.*shrink it"):
+        read_environment(path)
 
 
 # ------------------------------------------------------------------------------------------------ PNG

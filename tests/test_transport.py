@@ -100,7 +100,8 @@ def coarse(monkeypatch):
 def aimed(made: world.World) -> world.World:
     """Return a world whose whole environment is aimed at, bright or not."""
     (sky,) = made.scene.lights
-    return replace(made, lights=lights.compile_lights(environment=image.read_environment(sky.file), contrast=0.0))
+    pixels = image.read_environment(sky.file).radiance
+    return replace(made, lights=lights.compile_lights(environment=pixels, contrast=0.0))
 
 
 def take(scene: Scene, level: str, spp: int = 8, aim: bool = False, **how) -> Picture:

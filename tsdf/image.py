@@ -4,9 +4,11 @@ Pixels are linear sRGB (Rec. 709 primaries, white D65), (h, w, 3), row 0 on top.
 beside `format`, to OpenEXR. The directions that the pixels of an environment stand for are in `lights`.
 """
 
+import math
 import os
+import stat
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -24,6 +26,9 @@ MAX_PIXELS = 2**27
 MAX_EXPOSURE = 128.0  # [stops]
 WAVELENGTHS_NM = tuple(float(nm) for nm in range(385, 780, 10))
 WINDOWS = ("dataWindow", "displayWindow")
+MAX_NUMBERS = 2**25  # of an environment out of a small file: four channels of 4096 x 2048
+LARGEST_HALF = 65504.0  # beyond which 16-bit floats are infinite
+OTHERS = {b"#?": "Radiance HDR", b"\x89PNG": "PNG", b"\xff\xd8\xff": "JPEG", b"II*\0": "TIFF", b"MM\0*": "TIFF"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +110,9 @@ def write_exr(
 def read_exr(path: str | os.PathLike[str]) -> Image:
     """Return the image in an OpenEXR file.
 
-    The first part that has channels R, G, B, in any order and of any number type, or else a channel Y. The display
-    window is returned; what the data window leaves out of it is 0.
+    The first part that has channels R, G, B, in any order and of any number type, or else a channel Y, or else the only
+    layer of colour (say Combined.R, .G, .B). The display window is returned; what the data window leaves out of it is
+    0. Alpha is not looked at: colours are premultiplied. Of a mip map the finest level is read.
 
     Raises
     ------
@@ -114,67 +120,186 @@ def read_exr(path: str | os.PathLike[str]) -> Image:
         If there is no such file, it is not an OpenEXR image of colour, or it is truncated. Not all damage can be
         seen: OpenEXR has no checksums.
     """
+    return _read(path, math.inf)[0]
+
+
+def _read(path: str | os.PathLike[str], most: float) -> tuple[Image, Mapping[str, Any]]:
+    """Return the image in an OpenEXR file of so many numbers at most, and the header of its part."""
     import OpenEXR
 
     name = os.fspath(path)
     try:
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            raise TSDFError(f"{name} is not a regular file; name an .exr image")
         with open(path, "rb") as file:
-            magic = file.read(4)
+            magic = file.read(12)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise TSDFError(f"cannot read {name}: {reason}; check the name and the permissions") from error
-    if magic != MAGIC:
-        raise TSDFError(f"{name} is not an OpenEXR file (bytes 0); name an .exr image")
+    if not magic.startswith(MAGIC):
+        kind = next((kind for start, kind in OTHERS.items() if magic.startswith(start)), "")
+        way_out = (
+            f"but {kind}; save it as OpenEXR, with a converter or an image editor" if kind else "name an .exr image"
+        )
+        raise TSDFError(f"{name} is not an OpenEXR file (bytes 0), {way_out}")
     damaged = f"{name}: the file is damaged or truncated, fetch or make it again"
     try:
         headers = [part.header for part in OpenEXR.File(os.fsdecode(path), header_only=True).parts]
+        numbers = 0
         for header in headers:  # before the pixels, for OpenEXR allocates whatever a damaged header asks for
             for window in WINDOWS:
                 height, width = _size(header[window])
-                if not _readable(height, width):
+                numbers += height * width * (len(header["channels"]) if window == "dataWindow" else 0)
+                if not _readable(height, width) or numbers > most:
                     raise TSDFError(
                         f"{name}: {width} x {height} pixels ({window}) are not an image this reads; shrink it"
                     )
+        if headers and all("deep" in str(header["type"]) for header in headers):
+            raise TSDFError(f"{name}: its pixels are deep (several samples each), not an image; flatten it")
         parts = OpenEXR.File(os.fsdecode(path), separate_channels=True).parts
-    except (RuntimeError, ValueError, TypeError, KeyError, MemoryError) as error:
+    except (RuntimeError, ValueError, TypeError, KeyError, IndexError, MemoryError) as error:
         raise TSDFError(f"{damaged} ({_one_line(error)})") from error
     # OpenEXR leaves out the parts it cannot read, and only prints so
     if not headers or len(parts) != len(headers):
         raise TSDFError(damaged)
-    for header, part in zip(headers, parts, strict=True):
-        channels = part.channels
-        if rgb := _planes(header, channels, ("R", "G", "B")):
-            variance = _planes(header, channels, ("variance.R", "variance.G", "variance.B"))
-        elif "RY" not in channels and (rgb := _planes(header, channels, ("Y", "Y", "Y"))):
+    both = [(header, part.channels) for header, part in zip(headers, parts, strict=True)]
+    flat = [(header, channels) for header, channels in both if "deep" not in str(header["type"])]
+    for layer in ("", *_layers(name, flat)):
+        for header, channels in flat:
             variance = None
-        else:
-            continue
-        texts = {key: value for key, value in header.items() if isinstance(value, str)}
-        return Image(np.stack(rgb, axis=-1), np.stack(variance, axis=-1) if variance else None, texts)
-    names = ", ".join(sorted({channel for part in parts for channel in part.channels})) or "none"
-    raise TSDFError(f"{name}: no full-size channels R, G, B or Y, but {names:.100}; save it as an RGB image")
+            if rgb := _planes(header, channels, tuple(layer + c for c in "RGB")):
+                variance = _planes(header, channels, ("variance.R", "variance.G", "variance.B"))
+            elif not {"RY", "BY", "X"} & set(channels):
+                rgb = _planes(header, channels, ("Y", "Y", "Y"))
+            if rgb:
+                texts = {key: value for key, value in header.items() if isinstance(value, str)}
+                return Image(np.stack(rgb, axis=-1), np.stack(variance, axis=-1) if variance else None, texts), header
+    raise TSDFError(f"{name}: {_why_no_colour(flat)}; save it as an image with channels R, G, B")
 
 
-def read_environment(path: str | os.PathLike[str]) -> np.ndarray:
-    """Return the radiance of an environment, (h, w, 3) float64, from an OpenEXR file.
+def _layers(name: str, parts: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> list[str]:
+    """Return what stands before R, G, B in the names of channels, if that is one layer only or there is a plain one."""
+    names = {channel for _, channels in parts for channel in channels}
+    if {"R", "G", "B"} <= names or "Y" in names:
+        return []
+    layers = sorted(n[:-1] for n in names if n.endswith(".R") and {n[:-1] + "G", n[:-1] + "B"} <= names)
+    layers = [layer for layer in layers if layer != "variance."]
+    if len(layers) > 1:
+        raise TSDFError(
+            f"{name}: no plain channels R, G, B, but {len(layers)} layers ({', '.join(v[:-1] for v in layers):.100}); "
+            "save the one that is meant as R, G, B"
+        )
+    return layers
+
+
+def _why_no_colour(parts: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> str:
+    """Return why none of the parts is an image of colour."""
+    channels = {name: channel for _, part in parts for name, channel in part.items()}
+    if {"X", "Y", "Z"} <= set(channels):
+        return "its channels X, Y, Z are of CIE XYZ"
+    if {"RY", "BY"} & set(channels):
+        return "it has luminance and chroma (Y, RY, BY)"
+    thinned = [name for name, c in channels.items() if (c.xSampling, c.ySampling) != (1, 1)]
+    if thinned and {"R", "G", "B"} <= set(channels):
+        return f"its channel {thinned[0]} is subsampled"
+    return f"no full-size channels R, G, B or Y, but {', '.join(sorted(channels)) or 'none':.100}"
+
+
+class Environment(NamedTuple):
+    """Radiance from all directions, and what a user should know of it."""
+
+    radiance: np.ndarray  # (h, w, 3) float64, linear sRGB, finite and >= 0
+    notes: tuple[str, ...]  # one line each
+
+
+def read_environment(path: str | os.PathLike[str]) -> Environment:
+    """Return the radiance of a latitude-longitude environment from an OpenEXR file.
+
+    Pixels that are no radiance are mended, and a note says how many: what is negative or not a number becomes 0, what
+    is infinite the largest half-float, or the largest finite number of the image if that is more. Colours of other
+    primaries (ACES, say), if the file states them, are converted to linear sRGB. Notes also tell of an image that is
+    not twice as wide as high, but for one column, and of a data window that is not the whole image.
 
     Raises
     ------
     TSDFError
-        As `read_exr`; also if a pixel is not a number, infinite or negative, or if all are black.
+        As `read_exr`; also if it is a cube map by its attribute ``envmap``, if all pixels are black, and for an image
+        of more than 2^25 numbers, and more numbers than the file has bytes.
     """
-    rgb = read_exr(path).rgb.astype(np.float64)
     name = os.fspath(path)
-    bad = ~(np.isfinite(rgb) & (rgb >= 0.0))
-    if bad.any():
-        row, column, channel = np.argwhere(bad)[0]
-        raise TSDFError(
-            f"{name}: the pixel at row {row}, column {column} (from 0 at the top left) has {'RGB'[channel]} = "
-            f"{rgb[row, column, channel]:g}; radiance must be finite and not negative, repair the image"
+    try:
+        size = os.path.getsize(path)
+    except (OSError, ValueError):
+        size = 0  # `_read` says why
+    picture, header = _read(path, max(MAX_NUMBERS, size))
+    if "CUBE" in str(header.get("envmap")):
+        raise TSDFError(f"{name}: a cube map by its attribute envmap; convert it to latitude-longitude (exrenvmap)")
+    rgb = picture.rgb.astype(np.float64)
+    height, width = rgb.shape[:2]
+    notes = []
+    if width not in (1, 2 * height):
+        notes.append(
+            f"{width} x {height} pixels, not twice as wide as high: is it a panorama? It is taken as one of all "
+            "directions, in latitude and longitude"
         )
+    if any((a != b).any() for a, b in zip(*(np.asarray(header[window]) for window in WINDOWS), strict=True)):
+        notes.append("its data window is not its display window, which is taken as all directions; outside it is black")
+    rgb = _srgb(rgb, header, notes)
+    _mend(rgb, notes)
     if not rgb.any():
         raise TSDFError(f"{name}: every pixel is black, so it lights nothing; name another image")
-    return rgb
+    return Environment(rgb, tuple(f"{name}: {note}" for note in notes))
+
+
+def _srgb(rgb: np.ndarray, header: Mapping[str, Any], notes: list[str]) -> np.ndarray:
+    """Return colours in linear sRGB of those with the primaries and the white point that a header states."""
+    stated = header.get("chromaticities")
+    if stated is None:
+        return rgb
+    primaries = np.asarray(stated, dtype=np.float64).reshape(4, 2)
+    colour = _colour()
+    target = colour.RGB_COLOURSPACES["sRGB"]
+    if np.abs(primaries - np.vstack((target.primaries, target.whitepoint))).max() < 1e-3:
+        return rgb
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            source = colour.RGB_Colourspace("stated", primaries[:3], primaries[3])
+            matrix = np.asarray(colour.matrix_RGB_to_RGB(source, target, "Bradford"))
+        except (ValueError, ZeroDivisionError, np.linalg.LinAlgError):
+            matrix = np.full((3, 3), np.nan)
+    if not np.isfinite(matrix).all():
+        notes.append("its attribute chromaticities makes no sense; its colours are taken as linear sRGB")
+        return rgb
+    notes.append("colours converted to linear sRGB from the primaries that it states (chromaticities)")
+    with np.errstate(invalid="ignore", over="ignore"):
+        return rgb @ matrix.T
+
+
+def _mend(rgb: np.ndarray, notes: list[str]) -> None:
+    """Make every number of an image a radiance, in place, and note how many were none."""
+
+    def pixels(bad: np.ndarray) -> str:
+        count = int(bad.any(axis=2).sum())
+        return f"{count} pixel{'s are' if count > 1 else ' is'} "
+
+    nothing = np.isnan(rgb)
+    if nothing.any():
+        notes.append(f"{pixels(nothing)}not a number: taken as 0")
+        rgb[nothing] = 0.0
+    endless = rgb == math.inf
+    if endless.any():
+        most = max(LARGEST_HALF, float(rgb[~endless].max(initial=0.0)))
+        notes.append(f"{pixels(endless)}infinite: taken as {most:g}")
+        rgb[endless] = most
+    negative = rgb < 0.0
+    if negative.any():
+        lowest, total = float(rgb.min()), float(rgb.sum(where=~negative))
+        lost = -float(rgb.sum(where=negative)) / total if total > 0.0 else math.inf
+        notes.append(
+            f"{pixels(negative)}negative, down to {lowest:.2g}, {100.0 * lost:.2g} % of the sum of all: taken as 0"
+        )
+        rgb[negative] = 0.0
 
 
 def write_png(path: str | os.PathLike[str], rgb: npt.ArrayLike, exposure: float = 0.0) -> None:

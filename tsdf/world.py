@@ -187,7 +187,8 @@ def build(scene: Scene, level: str) -> World:
                 f"{scene.name}: [[medium]] {number} ({medium.name}): a grain of diameter {2.0 * medium.radius:g} does "
                 f"not fit into the medium, which is {extent:.3g} thin"
             )
-    lights = _lights(scene)
+    lights, said = _lights(scene)
+    notes += said
     if model == EXPLICIT and scene.media and lights.sampled:
         notes.append(
             f"{scene.name}: level explicit meets suns and small bright lights by chance alone: until many samples "
@@ -251,8 +252,10 @@ def _no_table() -> Table:
     return exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=8, joint=1))
 
 
-def _lights(scene: Scene) -> LightArrays:
+def _lights(scene: Scene) -> tuple[LightArrays, list[str]]:
+    """Return the lights of a scene, and what is to be said of its environment."""
     constant, suns, environment, rotation = np.zeros(3), [], None, 0.0
+    notes: list[str] = []
     for light in scene.lights:
         if isinstance(light, ConstantLight):
             constant += light.radiance
@@ -261,9 +264,12 @@ def _lights(scene: Scene) -> LightArrays:
         elif isinstance(light, EnvironmentLight):
             if environment is not None:
                 raise SceneError(f"{scene.name}: more than one environment light; add the images into one file")
-            environment, rotation = image.read_environment(light.file) * light.scale, light.rotation_deg
+            environment, said = image.read_environment(light.file)
+            environment *= light.scale
+            rotation = light.rotation_deg
+            notes += [f"{scene.name}: {note}" for note in said]
     try:
-        return compile_lights(constant, environment, rotation, suns)
+        return compile_lights(constant, environment, rotation, suns), notes
     except TSDFError as error:
         raise SceneError(f"{scene.name}: {error}") from None
 
