@@ -2,6 +2,7 @@
 
 import copy
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,7 +43,7 @@ angular_diameter_deg = 1.0
 irradiance = [3, 2, 1.5]
 [[medium]]
 name = "heap"
-shape = { type = "mesh", file = "heap.ply", scale = 2.0, translate = [0, 0, 1] }
+shape = { type = "mesh", file = "heap.ply", scale = 2.0, rotate = [0, 0, 45], translate = [0, 0, 1], up = "y" }
 packing_fraction = 0.6
 radius = 0.005
 packing_seed = 3
@@ -146,7 +147,7 @@ def test_a_whole_scene(folder):
         ),
         media=(
             scene.MediumSpec(
-                scene.Mesh(folder / "heap.ply", 2.0, (0.0, 0.0, 1.0)),
+                scene.Mesh(folder / "heap.ply", 2.0, (0.0, 0.0, 1.0), (0.0, 0.0, 45.0), "y"),
                 0.6,
                 0.005,
                 (
@@ -286,7 +287,7 @@ BROKEN = [  # (path, value, what the line says after the name of the scene)
     ("light/1/angular_diameter_deg", 0, "[[light]] 2 (sun): angular_diameter_deg must be > 0 and <= 180, not 0; 0 wo"),
     ("light/1/angular_diameter_deg", 181, "[[light]] 2 (sun): angular_diameter_deg must be > 0 and <= 180"),
     ("light/2/file", "sly.exr", "[[light]] 3 (environment): file 'sly.exr' does not exist; paths start at the folder"),
-    ("light/2/file", ".", "[[light]] 3 (environment): file '.' is not a file"),
+    ("light/2/file", ".", "[[light]] 3 (environment): file '.' is not a regular file"),
     ("light/2/file", "a\0b", "[[light]] 3 (environment): file 'a\\x00b' does not exist"),
     ("light/2/file", "x" * 5000, "[[light]] 3 (environment): file 'xxx"),
     ("light/2/file", "", "[[light]] 3 (environment): file must be the path of a file, not ''"),
@@ -296,7 +297,7 @@ BROKEN = [  # (path, value, what the line says after the name of the scene)
     ("medium/0/raduis", 1.0, MEDIUM + "unknown key 'raduis'; did you mean 'radius'?"),
     ("medium/0/radius", 0, MEDIUM + "radius must be > 0, not 0"),
     ("medium/0/name", 3, "[[medium]] 1: name must be text, not 3"),
-    ("medium/0/name", "a\nb", None),  # a name may hold anything, for only a printable one is shown
+    ("medium/0/name", "a\nb", None),  # a name may hold anything, and is shown as one printable line
     ("medium/0/packing_fraction", 0, MEDIUM + "packing_fraction must be > 0 and <= 0.74, not 0; equal"),
     ("medium/0/packing_fraction", 0.75, MEDIUM + "packing_fraction must be > 0 and <= 0.74, not 0.75"),
     ("medium/0/packing_seed", 1.5, MEDIUM + "packing_seed must be a whole number"),
@@ -315,7 +316,28 @@ BROKEN = [  # (path, value, what the line says after the name of the scene)
     ("medium/0/shape", {"type": "sphere", "centre": [0, 0, 0], "radius": 0}, "shape: radius must be > 0, not 0"),
     ("medium/0/shape", {"type": "mesh", "file": "heap.obj"}, "shape: file 'heap.obj' does not exist"),
     ("medium/0/shape", {"type": "mesh", "file": "heap.ply", "scale": -1}, "shape: scale must be > 0, not -1"),
+    ("medium/0/shape", {"type": "mesh", "file": "heap.ply", "rotate": 90}, "shape: rotate must be a list of 3 numbers"),
+    ("medium/0/shape", {"type": "mesh", "file": "heap.ply", "up": "x"}, "shape: up cannot be 'x'; it is one of z, y"),
+    (
+        "medium/0/packing_spheres",
+        9 * 10**18,
+        "packing_spheres must be from 1 to 100000, not 9000000000000000000",
+    ),
+    (
+        "medium/0/packing_spheres",
+        16**9000,
+        "packing_spheres must be from 1 to 100000, not a whole number of 36001",
+    ),
     ("medium/0/grain", ..., MEDIUM + "'grain' is missing"),
+    ("medium/0/grain", [{"table": "snow.tsdf.exr"}] * 2000, MEDIUM + "there are 2000 [[medium.grain]], and at most 64"),
+    ("medium", [small()["medium"][0]] * 65, "there are 65 [[medium]], and at most 64 can be"),
+    (
+        "medium",
+        [small()["medium"][0] | {"grain": [{"table": "snow.tsdf.exr"}] * 33}] * 2,
+        "there are 66 [[medium.grain]] in all, at most 64 can be; join those",
+    ),
+    ("surface", [small()["surface"][0]] * 1001, "there are 1001 [[surface]], and at most 1000 can be"),
+    ("light", [small()["light"][0]] * 65, "there are 65 [[light]], and at most 64 can be"),
     ("medium/0/grain", [], MEDIUM + "grain must be a list of one or more tables: head each with [[medium.grain]]"),
     ("medium/0/grain/0/table", ..., GRAIN + ": 'table' is missing"),
     ("medium/0/grain/0/table", "no.exr", GRAIN + ": table 'no.exr' does not exist"),
@@ -427,6 +449,70 @@ def test_text_that_is_no_scene(tmp_path, content, expected):
         load(path)
     assert str(error.value).startswith(f"{path}: ") and expected in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_values_of_any_size_and_depth_are_answered(folder):
+    """Whatever nesting or length a value has, the answer is one short line at once."""
+    deep: dict = {}
+    for _ in range(100_000):
+        deep = {"a": deep}
+    for path in ("camera/position", "medium/0/radius", "medium/0/grain/0/absorption", "light/0/type", "surface"):
+        for value in (deep, "x" * 10**6, [[[1]]] * 10**5, 10**400):
+            with pytest.raises(SceneError) as error:
+                parse(edited(path, value), folder)
+            assert len(str(error.value)) < 300 and "\n" not in str(error.value)
+    with pytest.raises(SceneError, match="unknown key"):
+        parse(edited("camera/" + "x" * 10**6, 1), folder)
+
+
+def test_what_is_no_regular_file_is_refused(folder):
+    """A pipe, which would be read for ever, a device and a folder: as the scene itself and as a file it names."""
+    os.mkfifo(folder / "pipe")
+    for name in ("pipe", os.devnull, "."):
+        with pytest.raises(SceneError, match=r"is not a regular file|Is a directory"):
+            load(folder / name)
+        for path in ("light/2/file", "medium/0/grain/0/table", "medium/0/grain/0/mesh"):
+            with pytest.raises(SceneError, match="is not a regular file"):
+                parse(edited(path, name), folder)
+
+
+def test_a_file_too_large_for_a_scene_is_not_read(tmp_path):
+    """The size is looked at before anything is read."""
+    path = tmp_path / "a.toml"
+    with open(path, "wb") as file:
+        file.truncate(10**12)
+    with pytest.raises(SceneError, match="has 1000000000000 bytes, and a scene at most 1000000; is it a scene"):
+        load(path)
+
+
+# --- where a mesh is placed ---------------------------------------------------------
+
+
+def test_rotations_are_about_x_then_y_then_z(folder):
+    """Against scipy's extrinsic "xyz"; scaled about the file's origin, then moved; other orders fail."""
+    from scipy.spatial.transform import Rotation
+
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    mesh = scene.Mesh(folder / "heap.ply", 2.0, (1.0, 2.0, 3.0), (20.0, -70.0, 130.0))
+    expected = 2.0 * Rotation.from_euler("xyz", mesh.rotate, degrees=True).apply(points) + mesh.translate
+    assert np.abs(mesh.placed(points) - expected).max() < 1e-14
+    other = 2.0 * Rotation.from_euler("zyx", mesh.rotate[::-1], degrees=True).apply(points) + mesh.translate
+    assert np.abs(other - expected).max() > 0.1
+
+
+def test_a_file_whose_up_is_y_is_stood_upright(folder):
+    """Blender's OBJ and glTF: (x, y, z) is (x, -z, y) of the scene, exactly, before anything is turned; so is rotate =
+    [90, 0, 0]. Right angles are exact, and the default changes nothing."""
+    points = np.random.default_rng(1).normal(size=(5, 3))
+    x, y, z = points.T
+    upright = np.column_stack((x, -z, y))
+    file = folder / "heap.ply"
+    assert np.array_equal(scene.Mesh(file, up="y").placed(points), upright)
+    assert np.array_equal(scene.Mesh(file, rotate=(90.0, 0.0, 0.0)).placed(points), upright)
+    assert np.array_equal(scene.Mesh(file, rotate=(-270.0, 0.0, 0.0)).placed(points), upright)
+    turned = scene.Mesh(file, rotate=(0.0, 0.0, 90.0), up="y").placed(points)
+    assert np.array_equal(turned, np.column_stack((z, x, y)))
+    assert np.array_equal(scene.Mesh(file).placed(points), points)
 
 
 @pytest.mark.parametrize(("name", "expected"), [("no.toml", "No such file"), (".", "Is a directory"), ("a\0b", "null")])

@@ -241,7 +241,7 @@ def _surface_mesh(spec: SurfaceSpec, where: str) -> Triangles:
         vertices, faces = read_mesh(shape.file)
     except GrainError as error:
         raise SceneError(f"{where}: {_of_scenes(error)}") from None
-    points = np.asarray(vertices, np.float64) * shape.scale + np.array(shape.translate, np.float64)
+    points = shape.placed(vertices)
     if not np.isfinite(points).all():
         raise SceneError(f"{where}: {shape.file}: holds coordinates that are not finite; export the mesh again")
     corners = points[faces]
@@ -265,7 +265,7 @@ def _boundary(spec: MediumSpec, where: str) -> tuple[Triangles, tuple[str, ...]]
         body = grain_from_mesh(vertices, faces, name=str(shape.file))
     except GrainError as error:
         raise SceneError(f"{where}: {_of_scenes(error)}") from None
-    points = (body.centre + body.bounding_radius * body.vertices) * shape.scale + np.array(shape.translate)
+    points = shape.placed(body.centre + body.bounding_radius * body.vertices)
     return Triangles(points, body.faces), tuple(f"{where}: {note}" for note in body.notes)
 
 

@@ -3,12 +3,16 @@
 `load` reads a file, `parse` takes the same as a dict. Everything that can be known to be wrong without opening the
 files a scene names is refused here, in one line that names the scene, the place and the way out; that they exist is
 checked, what is in them is not. Lengths are in scene units, right-handed axes, radiances in linear RGB. No geometry is
-built here, no light is followed, and absorption spectra of materials come from `materials`.
+built here, no light is followed, and absorption spectra of materials come from `materials`. Paths in a scene may point
+anywhere its reader may read.
 """
 
 import difflib
+import errno
 import math
 import os
+import reprlib
+import stat
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
@@ -20,18 +24,26 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tsdf import image
 from tsdf.errors import SceneError, UsageError
 from tsdf.materials import MEDIA, optical_constants
 from tsdf.medium import MAX_PACKING_FRACTION
 from tsdf.table import Table
 
+UP = ("z", "y")
 LEVELS = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume", "volume-hg", "isotropic")
 INSIDE = ("grains", "centres")
 VISIBLE_NM = (380.0, 780.0)  # [nm] what an absorption spectrum must cover
 LARGEST = 1e30  # of any number in a scene, so that squares and products stay finite
-MAX_PIXELS = 65536  # along one side of the picture
+MAX_BYTES = 1_000_000  # of the TOML text
+MAX_SIDE = 65536  # [pixel] along one side of the picture
+MAX_PIXELS = 2**25  # of the picture: two gigabytes while it is made
 MAX_SAMPLES = 2**31 - 1  # per pixel
+MAX_GRAINS = 64  # kinds in all media together, each of which keeps a table in memory
+MAX_LIGHTS = 64
+MAX_MEDIA = 64
+MAX_SURFACES = 1000
+MAX_SPHERES = 100_000  # in a tile of the explicit level: a minute to pack
+MAX_NAME = 200  # [characters]
 METRES_PER_NM = 1e-9
 ABSORBING = tuple(name for name, medium in MEDIA.items() if medium.k is not None)
 
@@ -87,11 +99,23 @@ class SunLight:
 
 @dataclass(frozen=True)
 class Mesh:
-    """The triangles of a file, scaled about the origin of the file, then moved."""
+    """The triangles of a file, stood upright, scaled and turned about the origin of the file, then moved."""
 
     file: Path
     scale: float = 1.0
     translate: Triple = (0.0, 0.0, 0.0)
+    rotate: Triple = (0.0, 0.0, 0.0)  # about x, then y, then z, counter-clockwise seen from the axis' end [deg]
+    up: str = "z"  # axis of the file that becomes z; "y" turns it by 90 degrees about x first
+
+    def placed(self, points: ArrayLike) -> np.ndarray:
+        """Return points (n, 3) of the file where they are in the scene, (n, 3) float64 [unit]."""
+        placed = np.array(points, dtype=np.float64)
+        for axis, degrees in ((0, 90.0 if self.up == "y" else 0.0), *enumerate(self.rotate)):
+            if degrees % 360.0:
+                cosine, sine = _turned(degrees)
+                a, b = placed[:, axis - 2].copy(), placed[:, axis - 1].copy()
+                placed[:, axis - 2], placed[:, axis - 1] = cosine * a - sine * b, sine * a + cosine * b
+        return placed * self.scale + np.array(self.translate, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -198,6 +222,13 @@ def load(path: str | os.PathLike[str]) -> Scene:
     """
     name = os.fspath(path)
     try:
+        status = os.stat(path)
+        if stat.S_ISDIR(status.st_mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if not stat.S_ISREG(status.st_mode):
+            raise SceneError(f"{name}: is not a regular file; give the path of a TOML file")
+        if status.st_size > MAX_BYTES:
+            raise SceneError(f"{name}: has {status.st_size} bytes, and a scene at most {MAX_BYTES}; is it a scene?")
         data = tomllib.loads(Path(path).read_bytes().decode("utf-8-sig"))
     except OSError as error:
         raise SceneError(f"{name}: cannot be read: {error.strerror or error}; give the path of a TOML file") from error
@@ -304,14 +335,21 @@ Reader = Callable[[Any, str, _Place], Any]  # (value, its key, its place) -> wha
 _FIELDS = {"light": "lights", "medium": "media", "surface": "surfaces", "grain": "grains"}  # where not the key
 
 
+_BRIEF = reprlib.Repr()  # of what is deep or long, no more than can be shown
+_BRIEF.maxlist = _BRIEF.maxtuple = _BRIEF.maxdict = 40
+_BRIEF.maxstring = _BRIEF.maxother = 60
+
+
 def _shown(value: Any) -> str:
     """Return a short printable rendering of a value."""
-    text = str(value).lower() if isinstance(value, bool) else repr(value)
+    if isinstance(value, int) and abs(value) > LARGEST:
+        return f"a whole number of {value.bit_length()} bits"
+    text = str(value).lower() if isinstance(value, bool) else _BRIEF.repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _hint(word: str, valid: Sequence[str]) -> str:
-    near = difflib.get_close_matches(word, valid, 1)
+    near = difflib.get_close_matches(word[:MAX_NAME], valid, 1)
     return f"did you mean {near[0]!r}?" if near else f"it is one of {', '.join(valid)}"
 
 
@@ -361,6 +399,12 @@ def _text(value: Any, key: str, at: _Place) -> str:
     return value
 
 
+def _name(value: Any, key: str, at: _Place) -> str:
+    """Read what messages call a thing, as one short printable line."""
+    text = _text(value, key, at)[:MAX_NAME]
+    return text if text.isprintable() else ascii(text)[1:-1]
+
+
 def _choice(valid: Sequence[str]) -> Reader:
     def read(value: Any, key: str, at: _Place) -> str:
         if _text(value, key, at) not in valid:
@@ -399,7 +443,7 @@ def _file(value: Any, key: str, at: _Place) -> Path:
         at.fail(f"{key} must be the path of a file, not {_shown(value)}")
     path = at.folder / value
     if not os.path.isfile(path):  # unlike Path.is_file, never raises
-        what = "is not a file" if os.path.exists(path) else "does not exist"
+        what = "is not a regular file" if os.path.exists(path) else "does not exist"
         at.fail(f"{key} {_shown(str(value))} {what}; paths start at the folder of the scene")
     return path
 
@@ -441,13 +485,15 @@ def _tagged(**kinds: Reader) -> Reader:
     return read
 
 
-def _tables(title: str, table: Reader, least: int = 0) -> Reader:
+def _tables(title: str, table: Reader, most: int, least: int = 0) -> Reader:
     """Read an array of tables, each called by its number and its name or type."""
 
     def read(value: Any, key: str, at: _Place) -> tuple[Any, ...]:
         if not isinstance(value, list | tuple) or len(value) < least:
             some = "one or more tables" if least else "tables"
             at.fail(f"{key} must be a list of {some}: head each with {title}")
+        if len(value) > most:
+            at.fail(f"there are {len(value)} {title}, and at most {most} can be; join them")
         found = []
         for i, item in enumerate(value, 1):
             label = item.get("name", item.get("type")) if isinstance(item, Mapping) else None
@@ -489,6 +535,13 @@ def _absorption(value: Any, key: str, at: _Place) -> Absorption:
 # --- what must hold between the values of one table ---------------------------------
 
 
+def _turned(degrees: float) -> tuple[float, float]:
+    """Return cosine and sine of an angle, exact at right angles."""
+    if degrees % 90.0 == 0.0:
+        return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(degrees // 90.0) % 4]
+    return math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+
+
 def _direction(v: Triple) -> Triple | None:
     """Return `v` at unit length, None where it has none."""
     length = math.hypot(*v)
@@ -509,10 +562,8 @@ def _check_camera(camera: Camera, at: _Place) -> Camera:
         at.fail("up has no length; say up = [0, 0, 1]")
     if _parallel(view, up):
         at.fail("up is parallel to the view from position to target; turn it, say up = [0, 1, 0]")
-    if camera.width * camera.height > image.MAX_PIXELS:
-        at.fail(
-            f"a picture of {camera.width} x {camera.height} has more than {image.MAX_PIXELS} pixels; make it smaller"
-        )
+    if camera.width * camera.height > MAX_PIXELS:
+        at.fail(f"a picture of {camera.width} x {camera.height} has more than {MAX_PIXELS} pixels; make it smaller")
     return camera
 
 
@@ -527,8 +578,8 @@ def resized(scene: Scene, width: int | None) -> Scene:
     if width is None:
         return scene
     height = max(1, round(scene.camera.height * width / scene.camera.width))
-    if width < 1 or width * height > image.MAX_PIXELS or max(width, height) > MAX_PIXELS:
-        raise UsageError(f"a width of {width} is out of range: at least 1, at most {image.MAX_PIXELS} pixels in all")
+    if width < 1 or width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
+        raise UsageError(f"a width of {width} is out of range: at least 1, at most {MAX_PIXELS} pixels in all")
     return replace(scene, camera=replace(scene.camera, width=width, height=height))
 
 
@@ -570,6 +621,8 @@ def _check_scene(scene: Scene, at: _Place) -> Scene:
         at.fail("no lights, so the picture would be black; add a [[light]], say of type = 'constant'")
     if not scene.media and not scene.surfaces:
         at.fail("a camera looking at nothing; add a [[medium]] or a [[surface]]")
+    if (kinds := sum(len(medium.grains) for medium in scene.media)) > MAX_GRAINS:
+        at.fail(f"there are {kinds} [[medium.grain]] in all, at most {MAX_GRAINS} can be; join those that are alike")
     materials = [grain.absorption.material for medium in scene.media for grain in medium.grains]
     if scene.metres_per_unit is None and any(materials):
         at.fail("metres_per_unit is missing: absorption of a material is per metre; say metres_per_unit = 1.0")
@@ -579,7 +632,7 @@ def _check_scene(scene: Scene, at: _Place) -> Scene:
 # --- the keys of each table ---------------------------------------------------------
 
 _ANY, _POSITIVE, _NOT_NEGATIVE = _number(), _number(above=0.0), _number(0.0)
-_MESH = _table(Mesh, file=_file, scale=_POSITIVE, translate=_triple)
+_MESH = _table(Mesh, file=_file, scale=_POSITIVE, rotate=_triple, translate=_triple, up=_choice(UP))
 _BOX = _table(Box, _check_box, low=_triple, high=_triple)
 _SPHERE = _table(Sphere, centre=_triple, radius=_POSITIVE)
 _SLAB = _table(Slab, _check_slab, low=_ANY, high=_ANY)
@@ -599,18 +652,18 @@ _GRAIN = _table(GrainSpec, table=_file, fraction=_NOT_NEGATIVE, mesh=_file, abso
 _MEDIUM = _table(
     MediumSpec,
     _check_medium,
-    name=_text,
+    name=_name,
     shape=_section(_tagged(mesh=_MESH, box=_BOX, sphere=_SPHERE, slab=_SLAB)),
     packing_fraction=_number(above=0.0, high=MAX_PACKING_FRACTION, why="equal spheres fill at most 0.7405"),
     radius=_POSITIVE,
     inside=_choice(INSIDE),
     packing_seed=_integer(),
-    packing_spheres=_integer(1),
-    grain=_tables("[[medium.grain]]", _GRAIN, 1),
+    packing_spheres=_integer(1, MAX_SPHERES),
+    grain=_tables("[[medium.grain]]", _GRAIN, MAX_GRAINS, 1),
 )
 _SURFACE = _table(
     SurfaceSpec,
-    name=_text,
+    name=_name,
     shape=_section(_tagged(rectangle=_RECTANGLE, mesh=_MESH, box=_BOX, sphere=_SPHERE)),
     reflectance=_colour(1.0),
 )
@@ -621,8 +674,8 @@ _CAMERA = _table(
     target=_triple,
     up=_triple,
     fov_deg=_number(above=0.0, below=180.0),
-    width=_integer(1, MAX_PIXELS),
-    height=_integer(1, MAX_PIXELS),
+    width=_integer(1, MAX_SIDE),
+    height=_integer(1, MAX_SIDE),
     exposure=_number(-100.0, 100.0),
 )
 _SCENE = _table(
@@ -631,7 +684,7 @@ _SCENE = _table(
     metres_per_unit=_POSITIVE,
     camera=_section(_CAMERA),
     render=_section(_table(Render, level=_choice(LEVELS), spp=_integer(1, MAX_SAMPLES), seed=_integer())),
-    light=_tables("[[light]]", _LIGHT),
-    medium=_tables("[[medium]]", _MEDIUM),
-    surface=_tables("[[surface]]", _SURFACE),
+    light=_tables("[[light]]", _LIGHT, MAX_LIGHTS),
+    medium=_tables("[[medium]]", _MEDIUM, MAX_MEDIA),
+    surface=_tables("[[surface]]", _SURFACE, MAX_SURFACES),
 )

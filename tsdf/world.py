@@ -7,8 +7,9 @@ offsets kept together), teleport-memory (where neighbours are as well), explicit
 """
 
 import math
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike
 from tsdf import format, image
 from tsdf.errors import SceneError, TSDFError
 from tsdf.explicit import Packed, nothing_packed, packed
-from tsdf.geometry import MESH, Place, ball_hit, exact_hit, place
+from tsdf.geometry import MESH, Place, Triangles, ball_hit, exact_hit, place
 from tsdf.grains import first_hit, load_grain
 from tsdf.lights import LUMINANCE, LightArrays, compile_lights
 from tsdf.medium import Component, VolumeParameters, free_path, volume_parameters
@@ -54,6 +55,11 @@ from tsdf.walker import (
     Media,
 )  # fmt: skip
 
+CAPTIVES = 32  # paths that look for a way out from the camera
+BOUNCES = 500  # after which there is none; a hole of a thousandth of all surfaces is found by then
+SLOW = 1e5  # grains met by a path, beyond which it is said how long that takes
+ENDLESS = 1e7  # beyond which a path takes seconds
+EVENTS_PER_SECOND = 1e7  # of one thread, about
 DARKEST = 1e-300  # albedo, so that it has a logarithm
 FARTHEST = 1e300  # free path where nothing deflects, finite so that 0 of it is 0
 LOOKS = 200  # pixels along each side through which it is looked whether the camera sees anything
@@ -100,10 +106,8 @@ def camera_of(world: World) -> Camera:
     """Return the pinhole camera of a scene for kernels, relative to the scene's centre."""
     camera = world.scene.camera
     position = np.array(camera.position) - world.place.centre
-    view = np.array(camera.target) - np.array(camera.position)
-    view /= np.linalg.norm(view)
-    right = np.cross(view, np.array(camera.up))
-    right /= np.linalg.norm(right)
+    view = _unit(np.array(camera.target) - np.array(camera.position))
+    right = _unit(np.cross(view, _unit(np.array(camera.up))))
     down = np.cross(view, right)
     pixel = 2.0 * math.tan(0.5 * math.radians(camera.fov_deg)) / camera.width
     corner = view - 0.5 * pixel * (camera.width * right + camera.height * down)
@@ -114,8 +118,19 @@ def camera_of(world: World) -> Camera:
 
 
 def sees(world: World) -> bool:
-    """Return whether anything of the scene is in the picture, as far as one ray for each of some pixels tells."""
+    """Return whether anything of the scene is in the picture, as far as one ray for each of some pixels tells.
+
+    Raises
+    ------
+    SceneError
+        If the camera is shut in by white surfaces, between which paths would go on for ever.
+    """
     place, camera = world.place, camera_of(world)
+    if _shut_in(world, camera):
+        raise SceneError(
+            f"{world.scene.name}: the camera is shut in by white surfaces, where no light gets and no path ends; "
+            "move it out, open them or make them darker"
+        )
     width, height = world.scene.camera.width, world.scene.camera.height
     x, y = ((np.arange(min(n, LOOKS)) + 0.5) * n / min(n, LOOKS) for n in (width, height))
     ways = np.array(camera.corner) + x[:, None, None] * camera.right + y[None, :, None] * camera.down
@@ -135,6 +150,49 @@ def sees(world: World) -> bool:
     return False
 
 
+def _shut_in(world: World, camera: Camera) -> bool:
+    """Return whether paths from the camera neither leave the scene nor end, if media were clear; by following some."""
+    place, g = world.place, world.place.arrays
+    if not world.scene.surfaces:
+        return False
+    rng = np.random.default_rng(0)
+    ways = rng.normal(size=(CAPTIVES, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    points = np.tile(np.array(camera.origin), (CAPTIVES, 1))
+    brightest = g.reflectance.max(axis=1)
+    for _ in range(BOUNCES):
+        distance, normal, owner = np.full(len(points), np.inf), np.zeros((len(points), 3)), np.full(len(points), -1)
+        if g.solid:
+            facet = first_hit(place.engines[0], points, ways)
+            met = np.flatnonzero(facet >= 0)
+            plane = g.planes[facet[met]]
+            cosine = np.einsum("ij,ij->i", plane[:, :3], ways[met])
+            distance[met] = (plane[:, 3] - np.einsum("ij,ij->i", plane[:, :3], points[met])) / cosine
+            normal[met], owner[met] = plane[:, :3], g.surface[facet[met]]
+        for i in range(len(points) if len(g.balls) else 0):
+            t, b = ball_hit(g.balls, _triple(points[i]), _triple(ways[i]))
+            if b >= 0 and t < distance[i]:
+                distance[i], owner[i] = t, g.ball_surface[b]
+                normal[i] = _unit(points[i] + t * ways[i] - g.balls[b, :3])
+        if (owner < 0).any():
+            return False
+        goes_on = rng.random(len(points)) < brightest[owner]
+        if not goes_on.any():
+            return False
+        points, ways, distance, normal = (v[goes_on] for v in (points, ways, distance, normal))
+        normal *= -np.sign(np.einsum("ij,ij->i", normal, ways))[:, None]
+        points = points + distance[:, None] * ways
+        points += 1e-6 * (np.abs(points).max(axis=1, keepdims=True) + distance[:, None]) * normal
+        ways = normal + _units(rng.normal(size=normal.shape))  # a cosine-weighted direction
+        ways = _units(ways)
+    return True
+
+
+def _units(v: np.ndarray) -> np.ndarray:
+    units: np.ndarray = v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30)
+    return units
+
+
 def beam(world: World, origin: ArrayLike, direction: ArrayLike, width: float = 0.0) -> Camera:
     """Return a camera whose one pixel is a parallel beam, a square of given width about `origin` [unit]."""
     d = np.asarray(direction, np.float64) / np.linalg.norm(direction)
@@ -142,6 +200,13 @@ def beam(world: World, origin: ArrayLike, direction: ArrayLike, width: float = 0
     start = np.asarray(origin, np.float64) - world.place.centre - 0.5 * (a + b)
     still = (0.0, 0.0, 0.0)
     return Camera(_triple(start), _triple(a), _triple(b), _triple(d), still, still, 1)
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    """Return a vector at unit length, however short or long."""
+    v = v / np.abs(v).max()
+    unit: np.ndarray = v / np.linalg.norm(v)
+    return unit
 
 
 def _triple(v: np.ndarray) -> tuple[float, float, float]:
@@ -159,14 +224,15 @@ def build(scene: Scene, level: str) -> World:
     if level not in MODELS:
         raise SceneError(f"{scene.name}: no level {level!r}; levels are {', '.join(MODELS)}")
     model = MODELS[level]
-    read: dict[Path, Table] = {}
+    read: dict[str, Table] = {}
 
     def table_of(spec: GrainSpec) -> Table:
         if isinstance(spec.table, Table):
             return spec.table
-        if spec.table not in read:
-            read[spec.table] = format.read(spec.table)
-        return read[spec.table]
+        file = os.path.realpath(spec.table)  # each file once, by whatever name
+        if file not in read:
+            read[file] = format.read(spec.table)
+        return read[file]
 
     tables = [table_of(grain) for medium in scene.media for grain in medium.grains]
     made = place(scene, grains=model in (EXPLICIT, TELEPORT_MEMORY))
@@ -187,6 +253,7 @@ def build(scene: Scene, level: str) -> World:
                 f"{scene.name}: [[medium]] {number} ({medium.name}): a grain of diameter {2.0 * medium.radius:g} does "
                 f"not fit into the medium, which is {extent:.3g} thin"
             )
+    notes += _long_paths(scene, model, tables, made, parameters)
     lights, said = _lights(scene)
     notes += said
     if model == EXPLICIT and scene.media and lights.sampled:
@@ -234,6 +301,78 @@ def _memory(scene: Scene, tables: list[Table]) -> Memory:
     return memory_of(laws, fractions, [medium.radius for medium in scene.media], grains)
 
 
+def grains_met(
+    medium: MediumSpec, boundary: Triangles | None, inside: bool, extinction: float, transport: float
+) -> float:
+    """Return about how many lossless grains a path meets in a medium in the mean, from a camera outside or inside it.
+
+    The mean path through a body is its mean chord 4 V/S, whatever it scatters (Blanco & Fournier 2003); from the middle
+    of a ball out it is 9/32 of that squared over the transport mean free path, by diffusion.
+
+    Parameters
+    ----------
+    medium : MediumSpec
+    boundary : Triangles or None
+        Where the medium is bounded by a mesh.
+    inside : bool
+        Whether the camera is in the medium.
+    extinction, transport : float
+        Extinction coefficient [1/unit] and transport mean free path [unit].
+    """
+    chord = mean_chord(medium, boundary)
+    return max(chord, 9.0 / 32.0 * chord * chord / transport if inside else 0.0) * extinction
+
+
+def mean_chord(medium: MediumSpec, boundary: Triangles | None) -> float:
+    """Return the mean chord 4 V/S of a medium [unit], by its mesh where it has one."""
+    shape = medium.shape
+    if isinstance(shape, Slab):
+        return 2.0 * (shape.high - shape.low)
+    if isinstance(shape, Box):
+        return float(2.0 / (1.0 / (np.array(shape.high) - np.array(shape.low))).sum())
+    if isinstance(shape, Mesh):
+        assert boundary is not None
+        a, b, c = boundary.vertices[boundary.faces].swapaxes(0, 1)
+        area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+        return float(4.0 / 6.0 * abs(np.einsum("ij,ij->i", a, np.cross(b, c)).sum()) / area)
+    return 4.0 / 3.0 * shape.radius
+
+
+def _long_paths(
+    scene: Scene, model: int, tables: list[Table], place: Place, parameters: Sequence[VolumeParameters]
+) -> list[str]:
+    """Return what is to be said of media in which paths meet very many grains; SceneError where they hardly end."""
+    notes, at = [], 0
+    camera = np.array(scene.camera.position) - place.centre
+    for m, (medium, volume) in enumerate(zip(scene.media, parameters, strict=True)):
+        own = list(zip(medium.grains, tables[at : at + len(medium.grains)], strict=True))
+        at += len(own)
+        grains = [Component(table, grain.fraction, medium.radius) for grain, table in own]
+        extinction = free_path(grains, medium.packing_fraction).sigma_t
+        if model == ISOTROPIC and volume.albedo > 0.0:
+            extinction *= 1.0 - volume.g
+        inside = bool(place.inside(m, camera[None])[0])
+        events = grains_met(medium, place.boundaries[m], inside, extinction, volume.transport_mean_free_path)
+        kept = max(
+            table.albedo(_least(grain.absorption, scene.metres_per_unit) * medium.radius) / max(table.albedo(), DARKEST)
+            for grain, table in own
+        )
+        events = min(events, 1.0 / max(1.0 - kept, DARKEST))  # absorption ends paths
+        where = f"{scene.name}: [[medium]] {m + 1} ({medium.name}): light meets about {events:.1g} grains in the mean"
+        if not events <= ENDLESS:
+            raise SceneError(
+                f"{where} on its way through, which would take minutes a path; take larger grains, a smaller medium or "
+                "a lower packing fraction"
+            )
+        if events > SLOW:
+            pixels = scene.camera.width * scene.camera.height
+            notes.append(
+                f"{where} on its way through: a sample of each of the {pixels} pixels takes about "
+                f"{pixels * events / EVENTS_PER_SECOND:.1g} s of one thread"
+            )
+    return notes
+
+
 def _extent(medium: MediumSpec, vertices: np.ndarray | None) -> float:
     """Return the smallest extent of a medium along the axes."""
     shape = medium.shape
@@ -272,6 +411,12 @@ def _lights(scene: Scene) -> tuple[LightArrays, list[str]]:
         return compile_lights(constant, environment, rotation, suns), notes
     except TSDFError as error:
         raise SceneError(f"{scene.name}: {error}") from None
+
+
+def _least(spec: AbsorptionSpec, metres_per_unit: float | None) -> float:
+    """Return the least absorption coefficient of any wavelength or channel [1/unit]."""
+    by_wavelength, by_channel = _spectra(spec, metres_per_unit)
+    return float(by_channel.min() if by_wavelength is None else by_wavelength.min())
 
 
 def _spectra(spec: AbsorptionSpec, metres_per_unit: float | None) -> tuple[np.ndarray | None, np.ndarray]:
