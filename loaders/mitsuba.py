@@ -168,10 +168,13 @@ class Bulk:
             return values[0] if values[0] == values[1] == values[2] else {"type": "rgb", "value": values}
 
         values = ",".join(f"{v:.9g}" for v in self.phase())
+        # Colours are reflectances to Mitsuba, at most 1 (its issue 1620)
+        scale = 1.0 if len(set(sigma_t)) == 1 else max(sigma_t)
         return {
             "type": "homogeneous",
             "albedo": spectrum([min(a, 1.0) for a in albedo]),
-            "sigma_t": spectrum(sigma_t),
+            "sigma_t": spectrum([s / scale for s in sigma_t]),
+            "scale": scale,
             "phase": {"type": "tabphase", "values": values},
         }
 
@@ -209,8 +212,9 @@ def medium(
     Returns
     -------
     dict
-        For ``interior`` or ``exterior`` of a shape in ``mi.load_dict``; its sigma_t, albedo and mean cosine are those
-        of `tsdf.medium.volume_parameters`. ``tabphase`` is grey: coloured absorption colours sigma_t and albedo only.
+        For ``interior`` or ``exterior`` of a shape in ``mi.load_dict``; its sigma_t times scale, albedo and mean cosine
+        are those of `tsdf.medium.volume_parameters`. ``tabphase`` is grey: coloured absorption colours sigma_t and
+        albedo only.
 
     Raises
     ------
@@ -1052,8 +1056,8 @@ def _plugins() -> tuple[Any, Any]:
             super().__init__(props)
             self.where = where
             self.sigma_t, self.albedo = (
-                [float(v) for v in (s["value"] if isinstance(s, dict) else [s] * 3)]
-                for s in (stock["sigma_t"], stock["albedo"])
+                [by * float(v) for v in (s["value"] if isinstance(s, dict) else [s] * 3)]
+                for s, by in ((stock["sigma_t"], stock["scale"]), (stock["albedo"], 1.0))
             )
 
         def intersect_aabb(self, ray: Any) -> Any:

@@ -1,6 +1,7 @@
 """Mitsuba 3 with our plugins against our own renderer, which is the arbiter: pixel by pixel, and what must be exact."""
 
 import importlib
+import itertools
 import math
 import os
 import subprocess
@@ -34,6 +35,7 @@ from tsdf.scene import (
     SurfaceSpec,
 )
 
+dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba", reason='Mitsuba 3 is missing: pip install "tsdf-toolkit[mitsuba]"')
 L = importlib.import_module("tsdf.loaders.mitsuba")
 
@@ -441,6 +443,39 @@ def test_other_media_and_points_of_light(llvm, ball):
     body = {"type": "sphere", "bsdf": {"type": "null"}}
     refused({"a": body | {"interior": {"type": "homogeneous"}}}, "volpath")
     refused({"a": body | {"interior": L.granular(ball, 0.5, 0.1)}, "p": {"type": "point"}}, "area")
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e-2, 1.0])
+def test_coloured_media_load_in_every_unit(variant, unit, ball):
+    """Grains of 2 mm in um, mm, cm and m, absorption in every order of colours, strong, weak and none: the stock medium
+    loads, and says the extinction and the scattering of `volume_parameters` in each channel."""
+    radius = 2e-3 / unit
+    for colour in (*itertools.permutations((0.0, 20.0, 300.0)), (1e5, 1e5, 0.0), (0.0, 0.0, 1e-6), (5.0, 5.0, 5.0)):
+        sigma_a = [a * unit for a in colour]
+        made = mi.load_dict(L.medium(ball, 0.5, radius, sigma_a))
+        inside = mi.MediumInteraction3f() if variant == "scalar_rgb" else dr.zeros(mi.MediumInteraction3f)
+        scattering, _, extinction = made.get_scattering_coefficients(inside)
+        channels = [volume_parameters([Component(ball, radius=radius)], 0.5, [a]) for a in sigma_a]
+        assert np.array(extinction).ravel() == pytest.approx([c.sigma_t for c in channels], rel=1e-5)
+        assert np.array(scattering).ravel() == pytest.approx([c.sigma_s for c in channels], rel=1e-5)
+
+
+def test_units_change_no_coloured_picture(variant, ball):
+    """One ball of coloured grains in two units, 200 and 0.2 across, is one picture to float32; twice the absorption
+    is another: the negative control."""
+
+    def picture(unit, times=1.0):
+        interior = L.medium(ball, 0.5, 1.0 / unit, [a * unit * times for a in (0.05, 0.005, 0.0)])
+        look = mi.ScalarTransform4f().look_at([0, -800 / unit, 0], [0, 0, 0], [0, 0, 1])
+        film = {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+        body = {"type": "sphere", "radius": 100.0 / unit, "bsdf": {"type": "null"}, "interior": interior}
+        sensor = {"type": "perspective", "fov": 10, "to_world": look, "film": film}
+        scene = {"type": "scene", "integrator": {"type": "volpath", "max_depth": 50}, "sensor": sensor}
+        return np.array(mi.render(mi.load_dict(scene | {"light": CONSTANT, "body": body}), spp=64, seed=1)).mean((0, 1))
+
+    one = picture(1.0)
+    assert picture(1e3) == pytest.approx(one, rel=0.02)
+    assert picture(1.0, 2.0) != pytest.approx(one, rel=0.02)
 
 
 @pytest.mark.parametrize("rotation_deg", [0.0, 70.0])
