@@ -22,12 +22,14 @@ TARGETS = ("pbrt", "blender", "openpbr", "materialx", "arnold", "karma", "csv", 
     help="Bounding radius of the grains in scene units.",
 )  # fmt: skip
 @click.option(
-    "--absorption", metavar="X | R,G,B",
-    help="Absorption coefficient of the grains' material times bounding radius [1], >= 0, as tsdf-info takes it; one, "
-    "or red, green and blue.  [default: 0]",
+    "--absorption", metavar="X/R",
+    help="Absorption coefficient of the grains' material: X/R is X over the bounding radius, X/unit per scene unit, "
+    "X/mm (um, cm, m) per length, with --unit; X is one number, or red,green,blue.  [default: 0]",
 )  # fmt: skip
 @click.option("--material", metavar="NAME", help="Absorb as this material instead (ice, say); needs --unit.")
-@click.option("--unit", type=float, metavar="METRES", help="Length of the scene unit; only --material needs it.")
+@click.option(
+    "--unit", type=float, metavar="METRES", help="Length of the scene unit; only --material and X/mm need it."
+)
 @click.option(
     "--lobes", type=click.IntRange(1, 2),
     help="Henyey-Greenstein lobes where the target can mix two.  [default: two where needed; Blender: 1]",
@@ -50,6 +52,7 @@ def main(
     Each text says what level of model it stands for, what that costs and how many bounces it needs; a page on each
     target is in the folder docs.
     """
+    from tsdf.cli.absorption import times_radius
     from tsdf.errors import UsageError
 
     if not 0.0 < kept < 1.0:
@@ -64,7 +67,7 @@ def main(
         raise UsageError(f"--radius is a finite number of scene units > 0, not {radius:g}")
     if unit is not None and not 0.0 < unit < math.inf:
         raise UsageError(f"--unit is a finite number of metres > 0, not {unit:g}")
-    products = _products(absorption or "0")
+    products = times_radius(absorption, radius, unit, colours=True)
     if to == "npz" and out is None:
         raise UsageError("npz is no text: say with --out where to write it")
     if out is not None:
@@ -97,19 +100,6 @@ def main(
 
     with replacing(out) as temporary:
         temporary.write_text(text, encoding="utf-8")
-
-
-def _products(text: str) -> list[float]:
-    """Return the one number or the three of --absorption."""
-    from tsdf.errors import UsageError
-
-    try:
-        numbers = [float(word) for word in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in (1, 3) or not all(0.0 <= x < math.inf for x in numbers):
-        raise UsageError(f"--absorption is one finite number >= 0 or three (R,G,B), not {plain(text)!r}")
-    return numbers
 
 
 def _check_material(name: str) -> None:

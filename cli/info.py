@@ -22,12 +22,10 @@ UNITS = {"mean_z": "R", "mean_r": "R", "mean_miss_chord": "R", "mean_path_length
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON object.")
 @click.option(
     "--absorption",
-    type=float,
-    default=0.0,
-    show_default=True,
-    metavar="X",
-    help="Absorption coefficient times bounding radius [1], >= 0; albedo and mean cosine are then those of the "
-    "absorbing grain.",
+    metavar="X/R",
+    help="Absorption coefficient of the grain's material: X/R is X over the bounding radius, X/unit per unit of "
+    "--radius, X/mm (um, cm, m) per length, with --radius and --unit. Albedo and mean cosine are then those of the "
+    "absorbing grain.  [default: 0]",
 )
 @click.option(
     "--packing",
@@ -41,19 +39,25 @@ UNITS = {"mean_z": "R", "mean_r": "R", "mean_miss_chord": "R", "mean_path_length
     metavar="L",
     help="Bounding radius of the grains in that medium, whose lengths are then in the unit of L.  [default: in R]",
 )
-def main(file: str, as_json: bool, absorption: float, packing: float | None, radius: float | None) -> None:
+@click.option("--unit", type=float, metavar="METRES", help="Length of the unit of L; only X/mm (um, cm, m) needs it.")
+def main(
+    file: str, as_json: bool, absorption: str | None, packing: float | None, radius: float | None, unit: float | None
+) -> None:
     """Show what the table FILE holds: grain, optics, statistics with standard errors, errors, energy, origin."""
     from tsdf import format
+    from tsdf.cli.absorption import times_radius
     from tsdf.errors import UsageError
 
-    if not 0.0 <= absorption < math.inf:
-        raise UsageError(f"--absorption is a finite number >= 0, not {absorption:g}")
-    if radius is not None and packing is None:
+    if radius is not None and packing is None and absorption is None:
         raise UsageError("--radius is of the grains of a medium: give its --packing too")
+    for name, value in (("--radius", radius), ("--unit", unit)):
+        if value is not None and not 0.0 < value < math.inf:
+            raise UsageError(f"{name} is a finite number > 0, not {value:g}")
+    (product,) = times_radius(absorption, radius, unit)
     table = format.read(file)
-    facts = describe(table, absorption)
+    facts = describe(table, product, radius)
     if packing is not None:
-        facts["medium"] = describe_medium(table, packing, radius, absorption)
+        facts["medium"] = describe_medium(table, packing, radius, product)
     if as_json:
         click.echo(json.dumps(facts, indent=1))
     else:
@@ -61,19 +65,20 @@ def main(file: str, as_json: bool, absorption: float, packing: float | None, rad
             click.echo(plain(line))
 
 
-def describe(table: "Table", absorption: float = 0.0) -> dict[str, Any]:
+def describe(table: "Table", absorption_times_radius: float = 0.0, radius: float | None = None) -> dict[str, Any]:
     """Return what `table` says, as ``tsdf-info --json`` writes it; None where a number is unknown.
 
-    With absorption, `albedo` and `mean_cosine` are those of the absorbing grain. Their standard errors are unknown.
+    With absorption (sigma_a R), `albedo` and `mean_cosine` are those of the absorbing grain. Their standard errors are
+    unknown.
     """
     from tsdf.table import CONDITIONALS, thawed
 
     header = thawed(table.header)
     grain, optics, made = header["grain"], header["optics"], header["provenance"]
     statistics, errors = header["statistics"], header["standard_errors"]
-    if absorption > 0.0:
-        mean_cosine = table.mean_cosine(absorption)
-        statistics["albedo"] = table.albedo(absorption)
+    if absorption_times_radius > 0.0:
+        mean_cosine = table.mean_cosine(absorption_times_radius)
+        statistics["albedo"] = table.albedo(absorption_times_radius)
         statistics["mean_cosine"] = None if math.isnan(mean_cosine) else mean_cosine
         errors["albedo"] = errors["mean_cosine"] = None
     return {
@@ -83,7 +88,8 @@ def describe(table: "Table", absorption: float = 0.0) -> dict[str, Any]:
         **{key: grain[key] for key in ("bodies", "faces", "mesh_sha256", "notes")},
         **{key: optics[key] for key in ("eta", "fresnel", "material", "wavelength_nm", "k", "source")},
         **{key: made[key] for key in ("method", "paths", "seed", "max_bounces", "software", "command")},
-        "absorption": absorption,
+        "absorption_times_radius": absorption_times_radius,
+        "absorption": None if radius is None else absorption_times_radius / radius,
         **statistics,
         "standard_errors": errors,
         "table_error": header["table_error"],
@@ -99,7 +105,7 @@ def describe(table: "Table", absorption: float = 0.0) -> dict[str, Any]:
 
 
 def describe_medium(
-    table: "Table", packing: float, radius: float | None = None, absorption: float = 0.0
+    table: "Table", packing: float, radius: float | None = None, absorption_times_radius: float = 0.0
 ) -> dict[str, Any]:
     """Return the medium of packed grains, as ``tsdf-info --json`` writes it; None where a number is not finite.
 
@@ -111,7 +117,7 @@ def describe_medium(
     unit = 1.0 if radius is None else radius
     try:
         grains = [Component(table, radius=unit)]
-        path, volume = free_path(grains, packing), volume_parameters(grains, packing, [absorption / unit])
+        path, volume = free_path(grains, packing), volume_parameters(grains, packing, [absorption_times_radius / unit])
     except UsageError as error:
         raise UsageError(f"--packing or --radius: {error}") from error
     numbers = {name: getattr(path, name) for name in LENGTHS}
@@ -150,8 +156,9 @@ def _lines(facts: Mapping[str, Any]) -> Iterator[str]:
     if facts["source"]:
         yield row("source", facts["source"])
     yield "statistics"
-    if facts["absorption"]:
-        yield row("absorption", f"{facts['absorption']:g} / R, in albedo and mean_cosine; all else is lossless")
+    if product := facts["absorption_times_radius"]:
+        both = f"{product:g} / R" + ("" if facts["absorption"] is None else f", {facts['absorption']:g} / unit")
+        yield row("absorption", f"{both}, in albedo and mean_cosine; all else is lossless")
     for name, error in facts["standard_errors"].items():
         if name == "legendre_moments" or name not in facts:
             continue

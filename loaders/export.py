@@ -274,6 +274,10 @@ def notes(medium: Bulk, lobes: int, measured: dict[str, tuple[float, float]] | N
         f"error of the phase function: total variation {own:.2g} to the table"
         + (f" (two lobes would leave {two:.2g})" if lobes == 1 and two < one else ""),
     ]
+    if any(medium.absorption):
+        absorption = medium.absorption if len(set(medium.absorption)) > 1 else medium.absorption[:1]
+        both = (", ".join(f"{a * by:.4g}" for a in absorption) for by in (1.0, medium.radius))
+        said.append("the grains' material absorbs {} / scene unit, which is {} / R".format(*both))
     if measured is None:
         said.append("error of point scatterers: not measured (option --measure); docs/export.md lists some")
     else:
@@ -531,6 +535,7 @@ def facts(medium: Bulk) -> dict[str, float | list[float]]:
         "packing_fraction": medium.packing_fraction,
         "radius": medium.radius,
         "absorption": list(medium.absorption),
+        "absorption_times_radius": [a * medium.radius for a in medium.absorption],
         "sigma_t": medium.sigma_t.tolist(),
         "sigma_s": medium.sigma_s.tolist(),
         "sigma_a": medium.sigma_a.tolist(),

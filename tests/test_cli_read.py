@@ -48,7 +48,7 @@ def test_info_json_says_what_the_header_says():
     assert facts["standard_errors"]["mean_z"] == table.header["standard_errors"]["mean_z"] > 0
     for name in ("table_error", "factorisation_error", "energy_ledger", "fits"):
         assert set(facts[name]) == set(table.header[name])
-    assert (facts["joint_records"], facts["paths"], facts["absorption"]) == (8, 1 << 17, 0.0)
+    assert (facts["joint_records"], facts["paths"], facts["absorption_times_radius"]) == (8, 1 << 17, 0.0)
     assert (facts["memory_records"], facts["format_version"]) == (0, "1.0")
     facts = json.loads(run(info, CUBE.replace("cube.tsdf", "cube_memory.tsdf"), "--json").stdout)
     assert (facts["memory_records"], facts["joint_records"], facts["format_version"]) == (32, 0, "1.1")
@@ -64,26 +64,72 @@ def test_info_for_people():
 
 
 def test_absorption_changes_albedo_and_mean_cosine_only():
-    facts = json.loads(run(info, SPHERE, "--json", "--absorption", "0.1").stdout)
+    facts = json.loads(run(info, SPHERE, "--json", "--absorption", "0.1/R").stdout)
     lossless = json.loads(run(info, SPHERE, "--json").stdout)
     assert facts["albedo"] == format.read(SPHERE).albedo(0.1) == pytest.approx(0.847, abs=0.001)
     assert facts["mean_cosine"] == format.read(SPHERE).mean_cosine(0.1) > lossless["mean_cosine"]
-    assert (facts["absorption"], facts["mean_z"]) == (0.1, lossless["mean_z"])
+    assert (facts["absorption_times_radius"], facts["absorption"]) == (0.1, None)
+    assert facts["mean_z"] == lossless["mean_z"]
     assert facts["standard_errors"]["albedo"] is None
+    assert run(info, SPHERE, "--absorption", "1e300/R").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("given", "options", "product"),
+    [
+        ("0.1/R", (), 0.1),
+        ("0.1 / R", ("--radius", "7", "--packing", "0.5"), 0.1),
+        ("0.2/unit", ("--radius", "0.5"), 0.1),
+        ("5/mm", ("--radius", "0.5", "--unit", "1e-3"), 2.5),
+        ("5/mm", ("--radius", "2e-3", "--unit", "1"), 10.0),
+        ("50/cm", ("--radius", "2", "--unit", "1e-3"), 10.0),
+        ("5000/m", ("--radius", "2000", "--unit", "1e-6"), 10.0),
+        ("5e-3/um", ("--radius", "0.02", "--unit", "0.1"), 10.0),
+    ],
+)
+def test_absorption_has_a_unit(given, options, product):
+    """Times R, per unit of --radius or per length: the product by hand, and both conventions in text and JSON."""
+    result = run(info, SPHERE, "--json", "--absorption", given, *options)
+    facts = json.loads(result.stdout)
+    assert result.stderr == ""
+    assert facts["absorption_times_radius"] == pytest.approx(product, rel=1e-12)
+    assert facts["albedo"] == pytest.approx(format.read(SPHERE).albedo(product), rel=1e-12)
+    text = run(info, SPHERE, "--absorption", given, *options).stdout
+    radius = dict(zip(options[::2], options[1::2], strict=True)).get("--radius")
+    assert f"absorption           {product:g} / R" in text
+    if radius is None:
+        assert facts["absorption"] is None
+    else:
+        assert facts["absorption"] == pytest.approx(product / float(radius), rel=1e-12)
+        assert f"{product:g} / R, {product / float(radius):g} / unit," in text
+
+
+def test_a_bare_absorption_is_over_R():
+    """As what is shown says."""
+    assert json.loads(run(info, SPHERE, "--json", "--absorption", "0.1").stdout)["absorption_times_radius"] == 0.1
     assert "0.1 / R" in run(info, SPHERE, "--absorption", "0.1").stdout
-    assert run(info, SPHERE, "--absorption", "1e300").exit_code == 0
 
 
-@pytest.mark.parametrize("value", ["-1", "nan", "inf", "x"])
+@pytest.mark.parametrize(
+    "value", ["-1", "nan", "inf", "x", "", "/R", "1/", "1/mile", "1/r", "-1/R", "1,2,3/R", "1/R/R", "1/unit", "1/mm"]
+)
 def test_absorption_that_cannot_be(value):
-    fails(run(info, SPHERE, "--absorption", value), 2, "absorption")
+    fails(run(info, SPHERE, "--absorption", value), 2, "--absorption")
+
+
+def test_absorption_that_lacks_a_length():
+    """The way out names what is missing."""
+    fails(run(info, SPHERE, "--absorption", "1/unit"), 2, "--radius, the bounding radius")
+    fails(run(info, SPHERE, "--absorption", "1/mm", "--radius", "1"), 2, "--unit, the length of that unit in metres")
+    fails(run(info, SPHERE, "--absorption", "1e300/nm", "--radius", "1e300", "--unit", "1"), 2, "out of the range")
+    fails(run(info, SPHERE, "--absorption", "1/mm", "--radius", "0", "--unit", "1"), 2, "--radius", "> 0")
 
 
 def test_medium_of_packed_grains():
     """--packing says what `medium` says, in R; with --radius the same in its unit, absorption staying sigma_a R."""
     from tsdf.medium import Component, free_path, volume_parameters
 
-    facts = json.loads(run(info, CUBE, "--json", "--packing", "0.6", "--absorption", "0.1").stdout)["medium"]
+    facts = json.loads(run(info, CUBE, "--json", "--packing", "0.6", "--absorption", "0.1/R").stdout)["medium"]
     grains = [Component(format.read(CUBE))]
     path, volume = free_path(grains, 0.6), volume_parameters(grains, 0.6, [0.1])
     lengths = {"lambda_b": path.lambda_b, "lambda_beta": path.lambda_beta, "lambda_s": path.lambda_s}
@@ -91,7 +137,7 @@ def test_medium_of_packed_grains():
     coefficients = {name: getattr(volume, name) for name in ("sigma_t", "sigma_s", "sigma_a")}
     numbers = {"albedo": volume.albedo, "g": volume.g}
     assert facts == {"packing_fraction": 0.6, "radius": None} | lengths | coefficients | numbers
-    options = ("--packing", "0.6", "--absorption", "0.1", "--radius", "0.001")
+    options = ("--packing", "0.6", "--absorption", "0.1/R", "--radius", "0.001")
     scaled = json.loads(run(info, CUBE, "--json", *options).stdout)["medium"]
     assert all(scaled[name] == pytest.approx(0.001 * value) for name, value in lengths.items())
     assert all(scaled[name] == pytest.approx(1000.0 * value) for name, value in coefficients.items())

@@ -428,6 +428,20 @@ def test_csv_is_the_table(cube: Table) -> None:
     assert edges == cube.cos_theta_edges[:-1].tolist()
 
 
+@pytest.mark.parametrize(
+    ("given", "unit"), [("0.05,0.1,0.2/R", ()), ("0.1,0.2,0.4/unit", ()), ("0.2,0.4,0.8/mm", ("--unit", 5e-4))]
+)
+def test_absorption_in_any_unit_is_one_medium(given: str, unit: tuple[str, float]) -> None:
+    """Grains of R = 0.5 units, of half a millimetre each in the last case; the text says both conventions."""
+    text = written("karma", "--absorption", given, *unit)
+    assert "# the grains' material absorbs 0.1, 0.2, 0.4 / scene unit, which is 0.05, 0.1, 0.2 / R\n" in text
+    assert text == written("karma", "--absorption", "0.05,0.1,0.2")
+    lines = [line.split(",") for line in written("csv", "--absorption", given, *unit).splitlines()]
+    rows = {line[0]: float(line[-1]) for line in lines if line[0].startswith("medium.absorption")}
+    assert rows["medium.absorption[2]"] == pytest.approx(0.4)
+    assert rows["medium.absorption_times_radius[2]"] == pytest.approx(0.2)
+
+
 def test_npz_is_the_table(cube: Table, tmp_path: Path) -> None:
     """All arrays and the header, without pickles; the same bytes each time."""
     paths = [tmp_path / "a.npz", tmp_path / "b.npz"]
@@ -476,6 +490,8 @@ GOOD = {"--to": "pbrt", "--packing": "0.6", "--radius": "1"}
         ({"--absorption": "-1"}, 2, "--absorption"),
         ({"--absorption": "1,2"}, 2, "--absorption"),
         ({"--absorption": "red"}, 2, "--absorption"),
+        ({"--absorption": "1/yard"}, 2, "--absorption"),
+        ({"--absorption": "1,2,3/mm"}, 2, "--unit"),
         ({"--material": "ice"}, 2, "--unit"),
         ({"--material": "snow", "--unit": "1"}, 2, "ice"),
         ({"--material": "quartz", "--unit": "1"}, 2, "ice"),

@@ -20,11 +20,13 @@ from tsdf.errors import GrainError, SceneError
 from tsdf.grains import first_hit, grain_from_mesh, triangle_scene
 from tsdf.meshes import read_mesh
 from tsdf.room import BALL, BOX, CLOSED, MESH, OPEN, SLAB, Room, exact_depth, room_of
-from tsdf.scene import Box, MediumSpec, Mesh, Rectangle, Scene, Slab, Sphere, SurfaceSpec
+from tsdf.scene import FARTHEST, SMALLEST, Box, MediumSpec, Mesh, Rectangle, Scene, Slab, Sphere, SurfaceSpec
 from tsdf.vectors import KERNEL, dot, step
 
 SLACK = 2e-6  # [of a facet's largest coordinate] a point this near to a facet is on it: 30 float32 ulps
 FIELD_CELLS = 2_000_000  # of the grid of distances: half a second to make
+RANGE = 1e6  # of the largest coordinate to the smallest extent of a medium, which a facet that large blurs
+DIGITS = 1e-9  # of a coordinate is the least size there
 LEAST_OVERLAP = 1e-3  # [of the smaller extent] media that overlap by less only touch
 NONE = -1
 
@@ -319,6 +321,8 @@ def place(scene: Scene, grains: bool = False) -> Place:
         for i, s in enumerate(scene.surfaces, 1)
     ]
 
+    _check_sizes(scene, boundaries, surfaces)
+
     # The media's middle is the origin, where float32 is finest
     nothing = np.full(3, math.inf)
     low, high = _extent(nothing, -nothing, boundaries)
@@ -406,6 +410,39 @@ def place(scene: Scene, grains: bool = False) -> Place:
     made = Place(arrays, engines, first_facet, centre, boundaries, surfaces, room, tuple(notes))
     _no_overlap(made, scene, grains)
     return made
+
+
+def _check_sizes(scene: Scene, boundaries: Sequence[Triangles | None], surfaces: Sequence[Triangles | None]) -> None:
+    """Refuse sizes that the numbers of the ray engine cannot hold, and media too thin for what is around them."""
+    specs: list[MediumSpec | SurfaceSpec] = [*scene.media, *scene.surfaces]
+    meshes = [*boundaries, *surfaces]
+    media = len(scene.media)
+    for i, (spec, mesh) in enumerate(zip(specs, meshes, strict=True)):
+        shape = spec.shape
+        if mesh is not None:
+            low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        elif isinstance(shape, Sphere):
+            low, high = np.array(shape.centre) - shape.radius, np.array(shape.centre) + shape.radius
+        else:
+            assert isinstance(shape, Box | Slab)
+            low, high = (np.ones(3) * end for end in (shape.low, shape.high))
+        kind, number = ("medium", i + 1) if i < media else ("surface", i + 1 - media)
+        title = f"{scene.name}: [[{kind}]] {number} ({spec.name})"
+        size, farthest = float((high - low).max()), float(max(np.abs(low).max(), np.abs(high).max()))
+        if not (size >= max(SMALLEST, DIGITS * farthest) and farthest <= FARTHEST):
+            raise SceneError(
+                f"{title}: is {size:.3g} wide and up to {farthest:.3g} from the origin, but sizes are at least "
+                f"{SMALLEST:g} and a billionth of such distances, which are at most {FARTHEST:g}; move or scale it"
+            )
+        thin, middle = float((high - low).min()), 0.5 * (low + high)
+        if isinstance(shape, Slab):
+            middle[:2] = 0.0
+        reach = max((float(np.abs(m.vertices - middle).max()) for m in meshes if m is not None), default=0.0)
+        if i < media and reach > RANGE * thin:
+            raise SceneError(
+                f"{title}: is {thin:.3g} thin, and a facet reaches {reach:.3g} away, which blurs all below a millionth "
+                "of that; cut down what is far, or make the medium thicker"
+            )
 
 
 def _moved(kind: np.ndarray, shape: np.ndarray, out: np.ndarray) -> np.ndarray:

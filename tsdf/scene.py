@@ -34,6 +34,8 @@ LEVELS = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume",
 INSIDE = ("grains", "centres")
 VISIBLE_NM = (380.0, 780.0)  # [nm] what an absorption spectrum must cover
 LARGEST = 1e30  # of any number in a scene, so that squares and products stay finite
+FARTHEST = 1e15  # [unit] of any coordinate: the ray engine's numbers are float32
+SMALLEST = 1e-12  # [unit] of anything that has a size
 MAX_BYTES = 1_000_000  # of the TOML text
 MAX_SIDE = 65536  # [pixel] along one side of the picture
 MAX_PIXELS = 2**25  # of the picture: two gigabytes while it is made
@@ -335,15 +337,20 @@ Reader = Callable[[Any, str, _Place], Any]  # (value, its key, its place) -> wha
 _FIELDS = {"light": "lights", "medium": "media", "surface": "surfaces", "grain": "grains"}  # where not the key
 
 
-_BRIEF = reprlib.Repr()  # of what is deep or long, no more than can be shown
+class _Brief(reprlib.Repr):
+    """Of what is deep or long, no more than can be shown."""
+
+    def repr_int(self, value: int, _: int) -> str:
+        return repr(value) if abs(value) <= LARGEST else f"a whole number of {value.bit_length()} bits"
+
+
+_BRIEF = _Brief()
 _BRIEF.maxlist = _BRIEF.maxtuple = _BRIEF.maxdict = 40
 _BRIEF.maxstring = _BRIEF.maxother = 60
 
 
 def _shown(value: Any) -> str:
     """Return a short printable rendering of a value."""
-    if isinstance(value, int) and abs(value) > LARGEST:
-        return f"a whole number of {value.bit_length()} bits"
     text = str(value).lower() if isinstance(value, bool) else _BRIEF.repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
@@ -425,6 +432,11 @@ def _triple(value: Any, key: str, at: _Place, element: Reader | None = None) -> 
         at.fail(f"{key} must be a list of 3 numbers, not {_shown(value)}")
     x, y, z = _numbers(value, key, at, element or _ANY)
     return x, y, z
+
+
+def _place(value: Any, key: str, at: _Place) -> Triple:
+    """Read a place or an extent [unit]."""
+    return _triple(value, key, at, _COORDINATE)
 
 
 def _colour(high: float = LARGEST) -> Reader:
@@ -632,11 +644,12 @@ def _check_scene(scene: Scene, at: _Place) -> Scene:
 # --- the keys of each table ---------------------------------------------------------
 
 _ANY, _POSITIVE, _NOT_NEGATIVE = _number(), _number(above=0.0), _number(0.0)
-_MESH = _table(Mesh, file=_file, scale=_POSITIVE, rotate=_triple, translate=_triple, up=_choice(UP))
-_BOX = _table(Box, _check_box, low=_triple, high=_triple)
-_SPHERE = _table(Sphere, centre=_triple, radius=_POSITIVE)
-_SLAB = _table(Slab, _check_slab, low=_ANY, high=_ANY)
-_RECTANGLE = _table(Rectangle, _check_rectangle, centre=_triple, u=_triple, v=_triple)
+_COORDINATE = _number(-FARTHEST, FARTHEST)
+_MESH = _table(Mesh, file=_file, scale=_POSITIVE, rotate=_triple, translate=_place, up=_choice(UP))
+_BOX = _table(Box, _check_box, low=_place, high=_place)
+_SPHERE = _table(Sphere, centre=_place, radius=_POSITIVE)
+_SLAB = _table(Slab, _check_slab, low=_COORDINATE, high=_COORDINATE)
+_RECTANGLE = _table(Rectangle, _check_rectangle, centre=_place, u=_place, v=_place)
 _LIGHT = _tagged(
     constant=_table(ConstantLight, radiance=_colour()),
     environment=_table(EnvironmentLight, file=_file, scale=_NOT_NEGATIVE, rotation_deg=_ANY),
@@ -670,8 +683,8 @@ _SURFACE = _table(
 _CAMERA = _table(
     Camera,
     _check_camera,
-    position=_triple,
-    target=_triple,
+    position=_place,
+    target=_place,
     up=_triple,
     fov_deg=_number(above=0.0, below=180.0),
     width=_integer(1, MAX_SIDE),

@@ -148,48 +148,50 @@ class Table:
         """The statistics of the lossless grain as the header states them."""
         return self.header["statistics"]
 
-    def survival(self, absorption: float) -> np.ndarray:
+    def survival(self, absorption_times_radius: float) -> np.ndarray:
         """Return the share of each column's light that an absorbing grain lets out, (columns,) float64 in [0, 1].
 
         Parameters
         ----------
-        absorption : float
-            sigma_a R, the absorption coefficient times the bounding radius, >= 0.
+        absorption_times_radius : float
+            sigma_a R, the absorption coefficient times the bounding radius [1], >= 0.
         """
-        if not (absorption >= 0.0):
-            raise UsageError(f"absorption must be a number >= 0 (sigma_a times the bounding radius), got {absorption}")
-        if absorption == 0.0:
+        if not (absorption_times_radius >= 0.0):
+            raise UsageError(
+                f"absorption must be a number >= 0 (sigma_a times the bounding radius), got {absorption_times_radius}"
+            )
+        if absorption_times_radius == 0.0:
             return np.ones(self.pixels.shape[1])
         share = np.zeros(self.pixels.shape[1])
         with np.errstate(under="ignore"):
             for mass, length in zip(self.p_l, self.block("mean_l"), strict=True):  # row by row: blocks may be large
-                share += mass * np.exp(-min(absorption, 1e30) * length.astype(np.float64))
+                share += mass * np.exp(-min(absorption_times_radius, 1e30) * length.astype(np.float64))
         return share
 
-    def deflection_masses(self, absorption: float = 0.0) -> np.ndarray:
+    def deflection_masses(self, absorption_times_radius: float = 0.0) -> np.ndarray:
         """Return the deflection distribution of what an absorbing grain lets out, (columns,) float64, sum 1.
 
         Zero everywhere where nothing is let out.
         """
-        masses = self.p_theta * self.survival(absorption)
+        masses = self.p_theta * self.survival(absorption_times_radius)
         total = masses.sum()
         return masses / total if total > 0.0 else masses
 
-    def albedo(self, absorption: float = 0.0) -> float:
+    def albedo(self, absorption_times_radius: float = 0.0) -> float:
         """Return the energy that leaves over the energy that met the grain (physics: E[exp(-sigma_a R l)])."""
         p = self.p_theta
-        return float(self.statistics["albedo"] * (p @ self.survival(absorption)) / p.sum())
+        return float(self.statistics["albedo"] * (p @ self.survival(absorption_times_radius)) / p.sum())
 
-    def mean_cosine(self, absorption: float = 0.0) -> float:
+    def mean_cosine(self, absorption_times_radius: float = 0.0) -> float:
         """Return the energy-weighted mean of cos theta of what an absorbing grain lets out, in [-1, 1].
 
         The lossless value is the header's own, which the cell width does not touch; absorption shifts it by the
         change of the masses between cells. Not a number where nothing is let out.
         """
         lossless = min(max(float(self.statistics["mean_cosine"]), -1.0), 1.0)
-        if absorption == 0.0:
+        if absorption_times_radius == 0.0:
             return lossless
-        masses = self.deflection_masses(absorption)
+        masses = self.deflection_masses(absorption_times_radius)
         if not masses.any():
             return math.nan
         edges = self.cos_theta_edges
