@@ -25,6 +25,8 @@ from tsdf.vectors import KERNEL, dot, step
 
 SLACK = 2e-6  # [of a facet's largest coordinate] a point this near to a facet is on it: 30 float32 ulps
 FIELD_CELLS = 2_000_000  # of the grid of distances: half a second to make
+FIELD_FACETS = 1_000_000  # about, the size of a cell, that facets are cut into there: seconds
+BATCH = 100_000  # facets that are cut at a time
 RANGE = 1e6  # of the largest coordinate to the smallest extent of a medium, which a facet that large blurs
 DIGITS = 1e-9  # of a coordinate is the least size there
 LEAST_OVERLAP = 1e-3  # [of the smaller extent] media that overlap by less only touch
@@ -512,10 +514,14 @@ def _field(
         nothing = np.full(3, math.inf)
         low, high = _extent(nothing, -nothing, meshes)
     size = np.maximum(high - low, 1e-3 * (high - low).max())
-    h = float((size.prod() / FIELD_CELLS) ** (1 / 3))
+    corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
+    ends = np.clip(corners, low, high)
+    sides = np.sort(ends.max(axis=1) - ends.min(axis=1), axis=1)
+    area = float((sides[:, 1] * sides[:, 2]).sum())  # of the facets in the grid, twice as much at most
+    h = max(float((size.prod() / FIELD_CELLS) ** (1 / 3)), math.sqrt(area / FIELD_FACETS))
     counts = np.ceil(size / h).astype(int) + 2
     low = 0.5 * (low + high) - 0.5 * counts * h
-    return distances(np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]), low, h, counts), low, h, endless
+    return distances(corners, low, h, counts), low, h, endless
 
 
 def distances(corners: np.ndarray, low: np.ndarray, step: float, counts: Sequence[int]) -> np.ndarray:
@@ -538,7 +544,9 @@ def distances(corners: np.ndarray, low: np.ndarray, step: float, counts: Sequenc
 
     high = low + step * np.asarray(counts)
     free = np.ones(tuple(counts), bool)
-    while len(corners):
+    waiting = [corners]
+    while waiting:
+        corners = waiting.pop()
         least, most = (
             extreme(extreme(*corners[:, :2].swapaxes(0, 1)), corners[:, 2]) for extreme in (np.minimum, np.maximum)
         )
@@ -557,7 +565,8 @@ def distances(corners: np.ndarray, low: np.ndarray, step: float, counts: Sequenc
         row = np.arange(len(corners))
         a, b, c = (corners[row, (longest + k) % 3] for k in (-1, 0, 1))
         middle = 0.5 * (a + b)
-        corners = np.concatenate((np.stack((a, middle, c), axis=1), np.stack((middle, b, c), axis=1)))
+        halves = np.concatenate((np.stack((a, middle, c), axis=1), np.stack((middle, b, c), axis=1)))
+        waiting += [halves[i : i + BATCH] for i in range(0, len(halves), BATCH)]
     if free.all():
         return np.full(tuple(counts), step * math.hypot(*counts), np.float32)
     bounds = distance_transform_edt(free, sampling=step) - math.sqrt(0.75) * step
