@@ -32,7 +32,7 @@ DOCUMENTS = sorted(path for path in DOCUMENTS if path.parts[-2][0] != "." and pa
 LANGUAGES = {"", "python", "cpp", "glsl", "toml", "xml", "hex", "json"}
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 COMMANDS: dict[str, click.Command] = {
-    name: getattr(import_module(place.partition(":")[0]), place.partition(":")[2]) for name, place in SCRIPTS.items()
+    name: import_module(f"tsdf.cli.{name.removeprefix('tsdf-')}").main for name in SCRIPTS
 }
 FOREIGN = {"--no-index", "--editable"}  # options of other people's commands
 
