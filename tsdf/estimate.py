@@ -2,7 +2,8 @@
 
 `columns_of` is where fine cells become the columns of a table; `traced_table` makes a `Table` of them, as
 `exact.exact_table` does without counts. Everything is a function of its arguments alone, so equal counts give equal
-bytes.
+bytes: on any processor and with any number of threads, for sums have a fixed order (`product`; numpy's own do, those of
+BLAS and LAPACK do not), and functions whose last digits depend on vector instructions are those of `math` (`each`).
 """
 
 import math
@@ -35,6 +36,18 @@ STATISTICS = (
 )
 LICENCE = "CC0-1.0"
 SHIFT = (math.sqrt(5.0) - 1.0) / 2.0  # its multiples fall evenly into [0, 1)
+# What a statistic can be; sums of rounded numbers may miss it by their last digit
+RANGES = {
+    "hit_probability": (0.0, 1.0),
+    "albedo": (0.0, 1.0),
+    "mean_cosine": (-1.0, 1.0),
+    "mean_z": (-1.0, 2.0),
+    "mean_r": (0.0, 2.0),
+    "mean_miss_chord": (0.0, 2.0),
+    "mean_path_length": (0.0, math.inf),
+    "atom_forward": (0.0, 1.0),
+    "atom_backward": (0.0, 1.0),
+}
 
 
 @dataclass(frozen=True)
@@ -57,6 +70,19 @@ class TableError:
     def total_variation(self) -> float:
         """Their sum, an upper bound of what both do together."""
         return self.sampling_noise + self.cell_width
+
+
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the sums of (..., n) times (n, m), (..., m) float64, always added in the same order."""
+    out = np.zeros((*a.shape[:-1], b.shape[1]))
+    for k in range(len(b)):
+        out += a[..., k, None] * b[k]
+    return out
+
+
+def each(function: Callable[[float], float], values: np.ndarray) -> np.ndarray:
+    """Return a function of `math` of every element; the last digits of numpy's own depend on the processor."""
+    return np.array([function(value) for value in values.ravel().tolist()], dtype=np.float64).reshape(values.shape)
 
 
 def bounds(cells: int, fine: int) -> np.ndarray:
@@ -147,12 +173,21 @@ def _width(theta: np.ndarray, cells: int, parts: int) -> tuple[float, float]:
     # the noise of a square is known and subtracted: part by part in columns that clearly deviate, which leaves a
     # little too much elsewhere, so there over a window of columns if that leaves less
     alone = np.sqrt(np.maximum(squares, 0.0)).sum(axis=1)
-    window = np.ones(min(17, cells))
-    pooled = np.convolve(squares.mean(axis=1), window, "same") / np.convolve(np.ones(cells), window, "same")
+    pooled = _pooled(squares.mean(axis=1), min(17, cells))
     together = parts * np.sqrt(np.maximum(pooled, 0.0))
     clear = squares.sum(axis=1) > 3.0 * math.sqrt(2.0 / parts) * variances.sum(axis=1)
     width = 0.5 * np.where(clear, alone, np.minimum(alone, together)).sum()
     return float(width), float(np.sqrt(variances).sum() * math.sqrt(0.5 / math.pi))
+
+
+def _pooled(values: np.ndarray, window: int) -> np.ndarray:
+    """Return the mean of the values around each, as many as there are up to `window`."""
+    before = (window - 1) // 2
+    padded = np.pad(np.stack((values, np.ones(len(values)))), ((0, 0), (window - 1 - before, before)))
+    sums = np.zeros((2, len(values)))
+    for k in range(window):
+        sums += padded[:, k : k + len(values)]
+    return sums[0] / sums[1]
 
 
 def candidate_cells() -> list[int]:
@@ -234,14 +269,16 @@ def mutual_information(energy: np.ndarray) -> float:
         return 0.0
     p = energy / total
     group, a, b = p.sum(axis=(1, 2), keepdims=True), p.sum(axis=2, keepdims=True), p.sum(axis=1, keepdims=True)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        terms = p * np.log2(p * group / (a * b))
-    return float(np.nansum(terms))
+    lit = p > 0.0
+    terms = np.zeros(p.shape)
+    terms[lit] = p[lit] * each(math.log2, ratio(p * group, a * b)[lit])
+    return float(terms.sum())
 
 
 def _joint_variation(energy: np.ndarray) -> float:
     """Return the total variation between (groups, phi, r, z) and the product of its marginals given the group."""
-    p = energy / energy.sum()
+    total = energy.sum()
+    p = energy / total if total else energy
     group = p.sum(axis=(1, 2, 3), keepdims=True)
     given = ratio(p, group)
     product = given.sum(axis=(2, 3), keepdims=True) * given.sum(axis=(1, 3), keepdims=True)
@@ -272,7 +309,7 @@ def factorisation_error(
     r = (T.R_EDGES[:-1, None] + parts * (T.R_EDGES[1] - T.R_EDGES[0])).ravel()
     z = (T.Z_EDGES[:-1, None] + parts * (T.Z_EDGES[1] - T.Z_EDGES[0])).ravel()
     length = np.hypot(r[:, None], z[None, :])
-    density = (p_r * p_theta) @ p_z.T
+    density = product(p_r * p_theta, p_z.T)
     cells = density.repeat(4, axis=0).repeat(4, axis=1) / 16.0
     return {
         "mutual_information_bits": information,
@@ -452,18 +489,38 @@ def _calibrate(
         mean, spread = np.zeros(len(fields)), np.zeros((len(fields), len(fields)))
         for c in lit:
             x = (found[c][:, fields] - target) / unit
-            w = weights[c] * np.exp(x @ tilt)
+            w = weights[c] * each(math.exp, (x * tilt).sum(axis=1))
             w *= hit[c] / w.sum()
-            own = w @ x
+            own = (w[:, None] * x).sum(axis=0)
             mean += own
-            spread += (x * w[:, None]).T @ x - np.outer(own, own) / hit[c]
+            spread += (w[:, None, None] * x[:, :, None] * x[:, None, :]).sum(axis=0) - np.outer(own, own) / hit[c]
         if np.abs(mean).max() < 1e-9 * hit.sum():
             break
-        tilt = tilt - np.linalg.lstsq(spread, mean, rcond=1e-9)[0]
-        if not (np.abs(tilt) < 1.0).all():
+        tilt = tilt - _solution(spread, mean)
+        # weights that change by more than e^30 mean that a sample cannot have these means
+        if not ((np.abs(tilt) < 1.0).all() and (np.abs((every - target) / unit * tilt).sum(axis=1) < 30.0).all()):
             return
     for c in lit:
-        weights[c] = weights[c] * np.exp((found[c][:, fields] - target) / unit @ tilt)
+        weights[c] = weights[c] * each(math.exp, ((found[c][:, fields] - target) / unit * tilt).sum(axis=1))
+
+
+def _solution(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return x of matrix x = right for a small positive semi-definite matrix, 0 where it says nothing of x."""
+    matrix, x = matrix.copy(), right.copy()
+    least, left = 1e-9 * np.diag(matrix).max(), list(range(len(x)))
+    while left:
+        k = max(left, key=lambda i: matrix[i, i])
+        if not (matrix[k, k] > least):
+            break
+        left.remove(k)
+        x[k] /= matrix[k, k]
+        matrix[k] /= matrix[k, k]
+        for i in range(len(x)):
+            if i != k:
+                x[i] -= matrix[i, k] * x[k]
+                matrix[i] -= matrix[i, k] * matrix[k]
+    x[left] = 0.0
+    return x
 
 
 def _in_equal_cells(counts: np.ndarray, columns: int) -> np.ndarray:
@@ -474,7 +531,7 @@ def _in_equal_cells(counts: np.ndarray, columns: int) -> np.ndarray:
     before = places.astype(int)
     after = np.minimum(before + 1, counts.shape[-1])
     sums = running[..., before] + (places - before) * (running[..., after] - running[..., before])
-    return np.diff(sums, axis=-1)
+    return np.maximum(np.diff(sums, axis=-1), 0.0)
 
 
 def normalised(energy: np.ndarray) -> np.ndarray:
@@ -509,7 +566,18 @@ def assemble(
     ledger: Mapping[str, int],
     provenance: Mapping[str, Any],
 ) -> Table:
-    """Stack the blocks and write the header."""
+    """Stack the blocks and write the header, so that every rule of SPEC.md on values holds.
+
+    Sums of rounded numbers may put a mean beside its cell or a statistic beside its range, by no more than was
+    rounded: there they are put on the edge.
+    """
+    lower, upper = T.L_EDGES[:-1, None], np.append(T.L_EDGES[1:-1], math.inf)[:, None]
+    mean_l = np.where(conditionals["p_l"].astype(np.float32) > 0.0, np.clip(mean_l, lower, upper), 0.0)
+    statistics = (
+        statistics
+        | {name: min(max(statistics[name], low), high) for name, (low, high) in RANGES.items()}
+        | {"legendre_moments": [min(max(moment, -1.0), 1.0) for moment in statistics["legendre_moments"]]}
+    )
     axes = {
         "p_phi": ("phi_delta", "rad", T.PHI_EDGES),
         "p_r": ("r", "R", T.R_EDGES),
@@ -589,7 +657,9 @@ def traced_table(
     fine = np.concatenate(
         (tally.theta[:, T.FINE + 1 :], tally.theta[:, T.FINE - 1 :: -1], tally.theta[:, T.FINE : T.FINE + 1]), axis=1
     )
-    moments, moment_errors = jackknife(fine, lambda energy: ratio(energy @ matrix, energy.sum(axis=-1, keepdims=True)))
+    moments, moment_errors = jackknife(
+        fine, lambda energy: ratio(product(energy, matrix), energy.sum(axis=-1, keepdims=True))
+    )
     statistics: dict[str, Any] = dict(zip(STATISTICS, values[:-1].tolist(), strict=True))
     standard_errors: dict[str, Any] = dict(zip(STATISTICS, errors[:-1].tolist(), strict=True))
     moments[:2], moment_errors[:2] = (1.0, statistics["mean_cosine"]), (0.0, standard_errors["mean_cosine"])
