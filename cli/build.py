@@ -1,18 +1,22 @@
 """``tsdf-build``: a grain in, a table out."""
 
+import math
 import os
 import signal
 import sys
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from tsdf.cli.common import Tool
+from tsdf.cli.common import Tool, plain
 from tsdf.errors import GrainError, TSDFError, UsageError
 
 if TYPE_CHECKING:
     from tsdf.scatterometer import Build, Progress
+    from tsdf.table import Table
 
 DEFAULT_MATERIAL, DEFAULT_WAVELENGTH_NM = "ice", 550.0
 
@@ -81,26 +85,44 @@ def check_output(out: Path, *inputs: Path) -> None:
 
 
 class Bar:
-    """A progress bar on standard error: paths, rate, current error, time left."""
+    """A progress bar on standard error: paths, rate, time left, error; and a note if it will take long."""
+
+    LONG_S = 600.0  # what takes longer deserves a note [s]
 
     def __init__(self, target: float | None, quiet: bool) -> None:
         from tqdm import tqdm
 
-        self._target = target
-        self._bar = tqdm(unit=" paths", unit_scale=True, disable=quiet, file=sys.stderr, dynamic_ncols=True)
+        self._target, self._quiet, self._noted = target, quiet, False
+        hidden = True if quiet else None  # None: hidden too unless it is a terminal
+        self._bar = tqdm(unit=" paths", unit_scale=True, disable=hidden, file=sys.stderr, dynamic_ncols=True)
+        self._start: tuple[float, int] | None = None
 
     def __call__(self, progress: "Progress") -> None:
-        bar = self._bar
-        if bar.n == 0:
+        bar, now = self._bar, time.monotonic()
+        if self._start is None:
+            self._start = now, progress.paths
             bar.initial = progress.paths
+            bar.set_description_str("compiling, if for the first time", refresh=False)
         bar.total = progress.total
-        if self._target is not None and progress.error is not None and progress.paths:
-            # noise falls as the square root of the paths: a guess of how many the target takes
-            bar.total = int(progress.paths * max(1.0, progress.error / self._target) ** 2)
+        if progress.paths > bar.initial:
+            bar.set_description_str("", refresh=False)
         if progress.error is not None:
-            bar.set_postfix_str(f"total variation {progress.error:.2g}, {progress.cells} cells", refresh=False)
+            goal = f" of {self._target:g}" if self._target is not None else ""
+            word = f"total variation {progress.error.total_variation:.2g}{goal}, {progress.error.cells} cells"
+            bar.set_postfix_str(word, refresh=False)
         bar.n = progress.paths
         bar.refresh()
+        seconds, paths = now - self._start[0], progress.paths - self._start[1]
+        if self._target is not None and progress.total and paths and seconds > 5.0 and not (self._noted or self._quiet):
+            left = seconds * (progress.total - progress.paths) / paths
+            if left > self.LONG_S:
+                self._noted = True
+                bar.clear()
+                click.echo(
+                    f"note: --target-error {self._target:g} takes about {progress.total:.1e} paths, {left / 60:.0f} "
+                    "minutes more; --max-seconds S ends in time, and what Ctrl-C interrupts is kept",
+                    err=True,
+                )
 
     def close(self) -> None:
         """Leave the bar as it is."""
@@ -133,6 +155,12 @@ class Bar:
 @click.option("--traced", is_flag=True, help="Send the exact sphere through the Monte Carlo tracer, too.")
 @click.option("--paths", callback=_count, metavar="N", help="Paths to trace.  [default: 4e6]")
 @click.option("--target-error", type=float, metavar="E", help="Stop at this estimated total variation of p_theta.")
+@click.option(
+    "--max-seconds",
+    type=click.FloatRange(0.0),
+    metavar="S",
+    help="Stop tracing after S seconds and write the table as good as it got; --resume goes on all the same.",
+)
 @click.option("--cells", callback=_count, metavar="N", help="Cells of theta.  [default: 256, or what the target needs]")
 @click.option(
     "--joint", callback=_count, default="0", metavar="K", show_default=True, help="Joint records per cell of theta."
@@ -161,7 +189,12 @@ class Bar:
 )
 @click.option("--repair", is_flag=True, help="Try to close an open mesh, and say what that changed.")
 @click.option("--chunk", "part", callback=_part, metavar="i/n", help="Trace part i of n only; --out is for tsdf-merge.")
-@click.option("--resume", is_flag=True, help="Go on with an interrupted build of the same command.")
+@click.option(
+    "--resume",
+    is_flag=True,
+    help="Go on from the part file of an interrupted build of the same grain, optics and --seed; any --paths, "
+    "--target-error and --cells, --max-seconds 0 for the table as good as it got.",
+)
 @click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
 @click.option(
     "--grains",
@@ -182,6 +215,7 @@ def main(
     traced: bool,
     paths: int | None,
     target_error: float | None,
+    max_seconds: float | None,
     cells: int | None,
     joint: int,
     memory: int,
@@ -203,8 +237,8 @@ def main(
     if traced and grain != "sphere":
         raise UsageError("--traced is for the exact sphere; every other grain is traced anyway")
     exact = grain == "sphere" and not traced
-    if exact and (part is not None or resume or paths is not None):
-        raise UsageError("the exact sphere takes no paths, chunks or resuming; add --traced to trace it")
+    if exact and (part is not None or resume or paths is not None or max_seconds is not None):
+        raise UsageError("the exact sphere takes no paths, chunks, seconds or resuming; add --traced to trace it")
     if part is not None and target_error is not None:
         raise UsageError("parts cannot know when the whole meets a target: give --paths with --chunk")
     if repair and grain == "sphere":
@@ -242,26 +276,36 @@ def main(
 
     build = scatterometer.Build.start(shape, optics, effort)
     if resume and part_file.exists():
-        stored = scatterometer.Build.load(part_file)
-        if stored.request != build.request:
-            differing = ", ".join(key for key in build.request if build.request[key] != stored.request.get(key))
-            raise TSDFError(f"{part_file} is of another build (they differ in {differing}): delete it to start anew")
-        build = stored
+        build.take(scatterometer.Build.load(part_file), plain(part_file))
+        if not quiet and build.paths > (paths or build.paths):
+            click.echo(f"note: {plain(part_file)} holds {build.paths} paths already, and all are used", err=True)
     try:
-        _run(build, shape, threads or os.cpu_count() or 1, part, part_file, quiet)
-        table = build.table() if part is None else None
-    except (GrainError, UsageError):
-        part_file.unlink(missing_ok=True)  # a refused build cannot be gone on with
+        _run(build, shape, threads or os.cpu_count() or 1, part, part_file, quiet, max_seconds)
+        if part is None:
+            table = build.table(as_it_got=max_seconds is not None)
+    except GrainError:
+        part_file.unlink(missing_ok=True)  # a refused grain cannot be gone on with
         raise
+    except UsageError as error:
+        raise UsageError(
+            f"{error}; its {build.paths} paths are kept in {plain(part_file)}: --resume goes on with them, "
+            "--resume --max-seconds 0 makes the table as good as it got"
+        ) from None
     if part is not None:
         if not quiet:
-            click.echo(f"{out}: part {part[0]} of {part[1]}, {build.paths} paths; tsdf-merge makes the table")
+            click.echo(f"{plain(out)}: part {part[0]} of {part[1]}, {build.paths} paths; tsdf-merge makes the table")
         return
     finish(table, out, quiet)
-    part_file.unlink(missing_ok=True)
+    if short := build.falls_short():
+        click.echo(f"note: {short}; {plain(part_file)} is kept: --resume goes on", err=True)
+    else:
+        part_file.unlink(missing_ok=True)
 
 
-def _run(build: "Build", shape: Any, threads: int, part: tuple[int, int] | None, part_file: Path, quiet: bool) -> None:
+def _run(
+    build: "Build", shape: Any, threads: int, part: tuple[int, int] | None, part_file: Path, quiet: bool,
+    max_seconds: float | None,
+) -> None:  # fmt: skip
     """Trace with a progress bar; an interrupt says what is safe."""
 
     def stop(number: int, _: object) -> None:
@@ -270,11 +314,13 @@ def _run(build: "Build", shape: Any, threads: int, part: tuple[int, int] | None,
     before = signal.signal(signal.SIGTERM, stop)
     bar = Bar(build.effort.target_error, quiet)
     try:
-        build.run(shape, threads, part or (1, 1), part_file, bar)
+        limit = math.inf if max_seconds is None else max_seconds
+        build.run(shape, threads, part or (1, 1), part_file, None if quiet else bar, max_seconds=limit)
     except KeyboardInterrupt as interrupt:
         bar.close()
         safe = (
-            f"{build.paths} paths are safe in {part_file}; go on with --resume"
+            f"{build.paths} paths are safe in {plain(part_file)}; go on with --resume, or with --resume "
+            "--max-seconds 0 for the table as good as it got"
             if part_file.exists()
             else "nothing done yet"
         )
@@ -285,7 +331,7 @@ def _run(build: "Build", shape: Any, threads: int, part: tuple[int, int] | None,
         signal.signal(signal.SIGTERM, before)
 
 
-def finish(table: Any, out: Path, quiet: bool) -> None:
+def finish(table: "Table", out: Path, quiet: bool) -> None:
     """Write a finished table and sum it up on standard output."""
     from tsdf.format import write
 
@@ -296,9 +342,24 @@ def finish(table: Any, out: Path, quiet: bool) -> None:
         click.echo(f"warning: {leak:.1e} of the light was lost or cut off: see energy in tsdf-info", err=True)
     if quiet:
         return
-    s, errors = table.statistics, table.header["standard_errors"]
-    error = table.header["table_error"]
-    click.echo(f"{out}: {table.header['grain']['name']}, eta {table.header['optics']['eta']:.6g}")
+    click.echo(f"{plain(out)}: {plain(table.header['grain']['name'])}")
+    for line in summary(table):
+        click.echo(line)
+
+
+def summary(table: "Table") -> Iterator[str]:
+    """Yield the lines that sum a finished table up."""
+    grain, optics, error = table.header["grain"], table.header["optics"], table.header["table_error"]
+    s, errors, ledger = table.statistics, table.header["standard_errors"], table.header["energy_ledger"]
+    made_of = f", {plain(optics['material'])} at {optics['wavelength_nm']:g} nm" if optics["material"] else ""
+    yield f"  {'eta':40s}{optics['eta']:.6g}{made_of}"
+    if grain["kind"] == "mesh":
+        unit = "unit of the file" if not grain["parameters"] and "." in grain["name"] else "as built in"
+        yield f"  {'bounding radius R':40s}{grain['bounding_radius']:.6g} ({unit})"
+        bodies = f", {grain['bodies']} bodies" if grain["bodies"] > 1 else ""
+        yield f"  {'shape':40s}{grain['faces']} facets, {'convex' if grain['convex'] else 'not convex'}{bodies}"
+        filled = grain["volume"] / (4.0 / 3.0 * math.pi)
+        yield f"  {'share of the bounding sphere it fills':40s}{filled:.4f}"
     for label, name in (
         ("hit probability beta", "hit_probability"),
         ("mean cosine g", "mean_cosine"),
@@ -308,9 +369,11 @@ def finish(table: Any, out: Path, quiet: bool) -> None:
         ("mean path length [R]", "mean_path_length"),
         ("forward atom", "atom_forward"),
     ):
-        click.echo(f"  {label:40s}{s[name]:.6f} +- {errors[name]:.1e}")
-    click.echo(
+        yield f"  {label:40s}{s[name]:.6f} +- {errors[name]:.1e}"
+    if paths := table.header["provenance"]["paths"]:
+        yield f"  {'paths, cells of theta':40s}{paths}, {len(table.p_theta) - 2}"
+    yield (
         f"  {'total variation to the truth, about':40s}{error['total_variation']:.2g} "
         f"(noise {error['sampling_noise']:.2g}, cells {error['cell_width']:.2g})"
     )
-    click.echo(f"  {'light lost or cut off':40s}{leak:.1e}")
+    yield f"  {'light lost or cut off':40s}{(ledger['lost'] + ledger['truncated']) / ledger['launched']:.1e}"

@@ -1,5 +1,6 @@
 """``tsdf-build`` and ``tsdf-merge`` as a user meets them: what they print, refuse and leave behind."""
 
+import io
 import os
 import signal
 import subprocess
@@ -12,6 +13,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 import tsdf
+from tsdf.cli.build import Bar
 from tsdf.cli.build import main as build
 from tsdf.cli.merge import main as merge
 
@@ -69,12 +71,64 @@ def test_material_is_recorded(tmp_path: Path) -> None:
 
 
 def test_progress_and_summary(tmp_path: Path) -> None:
-    result = run("cube", "--eta", "1.31", "--paths", "20000", "--out", tmp_path / "c.exr")
-    assert result.exit_code == 0
-    assert "total variation" in result.stderr and "paths/s" in result.stderr
-    assert "light lost or cut off" in result.stdout
+    result = run("cube", "--material", "ice", "--paths", "20000", "--out", tmp_path / "c.exr")
+    assert result.exit_code == 0 and result.stderr == ""  # a file is no place for a bar
+    for line in ("light lost or cut off", "as built in", "12 facets, convex", "fills   0.3676", "1.311, ice at 550 nm"):
+        assert line in result.stdout
     quiet = run("cube", *FAST, "--out", tmp_path / "q.exr")
     assert quiet.exit_code == 0 and quiet.stdout == quiet.stderr == ""
+
+
+def test_the_bar_says_the_error_and_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a terminal: where it stands, the goal, and once, if it will take long, how long."""
+    from tsdf.estimate import TableError
+    from tsdf.scatterometer import Progress
+
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    terminal, clock = Terminal(), iter((0.0, 10.0, 20.0))
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr(time, "monotonic", lambda: next(clock))
+    bar = Bar(0.01, quiet=False)
+    bar(Progress())
+    assert "compiling, if for the first time" in terminal.getvalue()
+    for paths in (1000, 2000):
+        bar(Progress(paths, 10**6, 0, TableError(64, 0.02, 0.01)))
+    bar.close()
+    shown = terminal.getvalue()
+    assert "total variation 0.03 of 0.01, 64 cells" in shown and "k/1.00M" in shown
+    assert shown.count("note: --target-error 0.01 takes about 1.0e+06 paths, 166 minutes more") == 1
+
+
+def test_max_seconds_and_then_more(tmp_path: Path) -> None:
+    """The table as good as it got, the paths kept, and from them any other table."""
+    out = tmp_path / "x.exr"
+    words = ["cube", "--eta", "1.31", "--out", str(out)]
+    result = run(*words, "--target-error", "1e-3", "--max-seconds", "0")
+    assert result.exit_code == 0 and out.exists() and Path(f"{out}.part").exists()
+    assert "target error 0.001 is not met after" in result.stderr and "--resume goes on" in result.stderr
+    assert "total variation to the truth" in result.stdout
+    result = run(*words, "--target-error", "1e-5", "--resume")
+    assert result.exit_code == 2 and "out of reach" in one_line(result) and "are kept in" in result.stderr
+    assert Path(f"{out}.part").exists()
+    result = run(*words, "--target-error", "0.5", "--resume", "--quiet")
+    assert result.exit_code == 0 and not Path(f"{out}.part").exists()
+    assert tsdf.read(out).header["table_error"]["total_variation"] <= 0.5
+    result = run("sphere", "--max-seconds", "1", "--out", tmp_path / "s.exr")
+    assert result.exit_code == 2 and "--traced" in one_line(result)
+
+
+def test_a_grain_whose_name_has_a_line_break(tmp_path: Path) -> None:
+    """Such a name is a file's right: it is escaped where a header has room for one line only."""
+    from tsdf.grains import load_grain
+
+    grain, path = load_grain("octahedron"), tmp_path / "o\n.obj"
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in grain.vertices.tolist()]
+    path.write_text("\n".join([*lines, *(f"f {a} {b} {c}" for a, b, c in (grain.faces + 1).tolist())]))
+    assert run(path, *FAST, "--out", tmp_path / "x.exr").exit_code == 0
+    assert tsdf.read(tmp_path / "x.exr").header["grain"]["name"] == "o\\n.obj"
 
 
 def test_grains_are_listed() -> None:

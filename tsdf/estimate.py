@@ -23,6 +23,7 @@ from tsdf.tally import Tally
 
 LEGENDRE = 16  # highest Legendre moment in the header
 MIN_CELLS, MAX_CELLS = 8, T.COARSE
+HAZE = 0.3  # share of the noise that a cell width may be too large by
 STATISTICS = (
     "hit_probability",
     "albedo",
@@ -136,27 +137,86 @@ def jackknife(sums: np.ndarray, statistic: Callable[[np.ndarray], np.ndarray]) -
 
 
 def table_error(tally: Tally, cells: int) -> TableError:
-    """Estimate the total variation between p_theta in `cells` cells and the truth.
+    """Estimate the total variation between p_theta in `cells` cells and the truth; see `TableErrors`."""
+    return TableErrors(tally)(cells)
+
+
+class TableErrors:
+    """Estimates of the total variation between the truth and the tables of a tally, each made once, when asked for.
 
     The noise is the sum of the standard errors of the columns times sqrt(2 / pi), halved. The cell width shows in how
     parts of each column differ from what its mean density gives them (a linear density shows in full in two parts),
-    corrected for their own noise, in as many parts as the noise allows.
+    corrected for their own noise, in as many parts as the noise allows. So caustics narrower than a part come to light
+    only with more paths, and make the width grow.
+
+    Parameters
+    ----------
+    tally : Tally
+    cells : int, optional
+        The only number of cells that may be chosen; without it, any of `candidate_cells`.
     """
-    replicates = len(tally.theta)
-    theta = tally.theta * (replicates / tally.scalars[:, T.SCATTERED].sum())
-    noise = columns_of(theta, cells).std(axis=0, ddof=1).sum()
-    widths: list[float] = []
-    for parts in (2, 4, 8, 16):
-        if parts * cells > T.FINE:
-            break
-        width, blur = _width(theta[:, : T.FINE], cells, parts)
-        if widths and blur > 1.5 * width:
-            break
-        widths.append(width)
-    # what still finer parts would show: nothing where the density is smooth; at a caustic, whose cells deviate as the
-    # root of their width, the gains of ever finer parts add up to 2.4 times the last
-    hidden = 2.4 * max(0.0, widths[-1] - widths[-2]) if len(widths) > 1 else 0.0
-    return TableError(cells, float(noise * math.sqrt(0.5 / (math.pi * replicates))), widths[-1] + hidden)
+
+    def __init__(self, tally: Tally, cells: int | None = None) -> None:
+        self._theta = tally.theta * (len(tally.theta) / tally.scalars[:, T.SCATTERED].sum())
+        self._candidates = candidate_cells() if cells is None else [cells]
+        self._known: dict[int, TableError] = {}
+
+    def __call__(self, cells: int) -> TableError:
+        """Return the error in so many cells."""
+        if cells not in self._known:
+            self._known[cells] = self._estimate(cells)
+        return self._known[cells]
+
+    def _estimate(self, cells: int) -> TableError:
+        theta, replicates = self._theta, len(self._theta)
+        noise = columns_of(theta, cells).std(axis=0, ddof=1).sum()
+        widths: list[float] = []
+        for parts in (2, 4, 8, 16):
+            if parts * cells > T.FINE:
+                break
+            width, blur = _width(theta[:, : T.FINE], cells, parts)
+            if widths and blur > 1.5 * width:
+                break
+            widths.append(width)
+        # what still finer parts would show: nothing where the density is smooth; at a caustic, whose cells deviate as
+        # the root of their width, the gains of ever finer parts add up to 2.4 times the last
+        hidden = 2.4 * max(0.0, widths[-1] - widths[-2]) if len(widths) > 1 else 0.0
+        return TableError(cells, float(noise * math.sqrt(0.5 / (math.pi * replicates))), widths[-1] + hidden)
+
+    def best(self) -> TableError:
+        """Return the least error of all candidates: of those an octave apart, then of ever nearer neighbours."""
+        steps = [8, 4, 2, 1] if len(self._candidates) > 1 else [1]
+        tried = range(0, len(self._candidates), steps[0])
+        for step in steps:
+            best = min(tried, key=lambda i: self(self._candidates[i]).total_variation)
+            tried = range(max(0, best - step // 2), min(len(self._candidates), best + step // 2 + 1), max(1, step // 2))
+        return self(self._candidates[best])
+
+    def fewest(self, target: float) -> TableError | None:
+        """Return the error of the fewest cells that meet a target, by bisection, or None if none does."""
+        best = self.best()
+        if best.total_variation > target:
+            return None
+        low, high = -1, self._candidates.index(best.cells)
+        while high - low > 1:
+            middle = (low + high) // 2
+            if self(self._candidates[middle]).total_variation <= target:
+                high = middle
+            else:
+                low = middle
+        return self(self._candidates[high])
+
+    def needed(self, target: float) -> float:
+        """Return how many times as many paths will meet a target, for noise falls as their root; infinity if none.
+
+        What the cells cost counts as it shows now, less the noise that may show as width.
+        """
+        self.best()
+        rooms = [(error.sampling_noise, target - error.cell_width) for error in self._known.values()]
+        if factors := [(noise / room) ** 2 for noise, room in rooms if room > 0.0]:
+            return min(factors)
+        hopeless = all(-room > HAZE * noise for noise, room in rooms)
+        return math.inf if hopeless else max((noise / target) ** 2 for noise, _ in rooms)
 
 
 def _width(theta: np.ndarray, cells: int, parts: int) -> tuple[float, float]:
@@ -193,12 +253,6 @@ def _pooled(values: np.ndarray, window: int) -> np.ndarray:
 def candidate_cells() -> list[int]:
     """Return the numbers of cells that an automatic choice tries, ascending, an eighth of an octave apart."""
     return sorted({round(2.0 ** (k / 8.0)) for k in range(24, 81)})
-
-
-def smallest_enough(tally: Tally, target: float) -> TableError | None:
-    """Return the error of the fewest cells that meet `target`, or None if none does."""
-    errors = (table_error(tally, cells) for cells in candidate_cells())
-    return next((error for error in errors if error.total_variation <= target), None)
 
 
 def legendre_matrix(edges: np.ndarray) -> np.ndarray:
