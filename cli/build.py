@@ -141,7 +141,13 @@ class Bar:
     help="A parameter of a built-in grain; --grains lists them. May be given several times.",
 )
 @click.option("--eta", type=float, help="Relative refractive index n_inside / n_outside.  [default: ice at 550 nm]")
-@click.option("--material", help="ice, water, quartz, salt, glass or sucrose, in air.")
+@click.option(
+    "--material",
+    metavar="NAME|FILE",
+    help="Built in, in air: ice and water (200 to 4000 nm), quartz (198 to 2053.1), salt (200 to 30000), glass "
+    "(N-BK7, 300 to 2500), sucrose (400 to 700). Or a file of your own: lines of wavelength_nm,n,k under that header "
+    "(.csv), or an entry of refractiveindex.info (.yml).",
+)
 @click.option(
     "--wavelength-nm", type=float, help=f"Wavelength for --material [nm].  [default: {DEFAULT_WAVELENGTH_NM:g}]"
 )
@@ -248,16 +254,20 @@ def main(
     from tsdf.optics import Optics
 
     if eta is None:
-        from tsdf.materials import optical_constants
+        from tsdf.constants import constants_of
 
-        found = optical_constants(
+        found = constants_of(
             material or DEFAULT_MATERIAL, DEFAULT_WAVELENGTH_NM if wavelength_nm is None else wavelength_nm
         )
         optics = Optics(found.n, fresnel, found.material, found.wavelength_nm, found.k, found.source)
+        if found.k is not None and found.k > 0.01 and not quiet:
+            click.echo(
+                f"note: k is {found.k:.2g}: the reflectance of so dark a surface is taken as if k were 0", err=True
+            )
     else:
         optics = Optics(eta, fresnel)
     effort = scatterometer.Effort(paths, target_error, cells, joint, seed, max_bounces, memory)
-    check_output(out, Path(grain))
+    check_output(out, Path(grain), *([Path(material)] if material else []))
     part_file = out if part is not None else out.with_name(out.name + ".part")
     if not exact and part_file.exists() and not resume:
         if part is not None:

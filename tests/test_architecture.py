@@ -24,6 +24,7 @@ LAYERS = [
         "table",
         "tally",
         "archive",
+        "constants",
         "analytic",
         "exemplars",
         "surface",
@@ -55,6 +56,7 @@ DOORS = {
     "PIL": {"image"},
     "matplotlib": {"plots"},
     "jsonschema": {"container"},
+    "yaml": {"constants"},
 }
 
 
