@@ -13,11 +13,13 @@ import click
 
 from tsdf.cli.common import Tool, plain
 from tsdf.errors import GrainError, TSDFError, UsageError
+from tsdf.files import need_memory
 
 if TYPE_CHECKING:
     from tsdf.scatterometer import Build, Progress
     from tsdf.table import Table
 
+LEAST_MEMORY = 1_000_000_000  # bytes of address space that the libraries map, most of it never used
 DEFAULT_MATERIAL, DEFAULT_WAVELENGTH_NM = "ice", 550.0
 
 
@@ -250,6 +252,7 @@ def main(
     if repair and grain == "sphere":
         raise UsageError("--repair is for mesh files")
 
+    need_memory(LEAST_MEMORY)
     from tsdf import scatterometer
     from tsdf.optics import Optics
 
@@ -301,14 +304,13 @@ def main(
             f"{error}; its {build.paths} paths are kept in {plain(part_file)}: --resume goes on with them, "
             "--resume --max-seconds 0 makes the table as good as it got"
         ) from None
-    if part is not None:
-        if not quiet:
-            click.echo(f"{plain(out)}: part {part[0]} of {part[1]}, {build.paths} paths; tsdf-merge makes the table")
-        return
-    finish(table, out, quiet)
-    if short := build.falls_short():
+    if part is None:
+        finish(table, out, quiet)
+    elif not quiet:
+        click.echo(f"{plain(out)}: part {part[0]} of {part[1]}, {build.paths} paths; tsdf-merge makes the table")
+    if short := build.falls_short(part or (1, 1)):
         click.echo(f"note: {short}; {plain(part_file)} is kept: --resume goes on", err=True)
-    else:
+    elif part is None:
         part_file.unlink(missing_ok=True)
 
 

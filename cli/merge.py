@@ -4,8 +4,9 @@ from pathlib import Path
 
 import click
 
-from tsdf.cli.build import check_output, finish
+from tsdf.cli.build import LEAST_MEMORY, check_output, finish
 from tsdf.cli.common import Tool
+from tsdf.files import need_memory
 
 
 @click.command("tsdf-merge", cls=Tool)
@@ -14,7 +15,8 @@ from tsdf.cli.common import Tool
 @click.option("--quiet", is_flag=True, help="No summary.")
 def main(parts: tuple[Path, ...], out: Path, quiet: bool) -> None:
     """Merge the PARTS that tsdf-build --chunk i/n wrote, in any order, into one table."""
+    check_output(out, *parts)
+    need_memory(LEAST_MEMORY)
     from tsdf.scatterometer import merge
 
-    check_output(out, *parts)
     finish(merge(list(parts)).table(), out, quiet)

@@ -2,6 +2,7 @@
 
 import io
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -116,6 +117,11 @@ def test_max_seconds_and_then_more(tmp_path: Path) -> None:
     result = run(*words, "--target-error", "0.5", "--resume", "--quiet")
     assert result.exit_code == 0 and not Path(f"{out}.part").exists()
     assert tsdf.read(out).header["table_error"]["total_variation"] <= 0.5
+    part = ["cube", "--eta", "1.31", "--paths", "1e7", "--chunk", "1/2", "--out", tmp_path / "1.part"]
+    result = run(*part, "--max-seconds", "0")
+    assert (
+        result.exit_code == 0 and "of 4920960 paths are done" in result.stderr and "--resume goes on" in result.stderr
+    )
     result = run("sphere", "--max-seconds", "1", "--out", tmp_path / "s.exr")
     assert result.exit_code == 2 and "--traced" in one_line(result)
 
@@ -319,3 +325,16 @@ def test_an_unfinished_target_is_no_table(tmp_path: Path) -> None:
     result = CliRunner().invoke(merge, [str(tmp_path / "y.part"), "--out", str(tmp_path / "y.exr")])
     assert result.exit_code == 1 and "not met" in one_line(result)
     assert not (tmp_path / "y.exr").exists()
+
+
+@pytest.mark.parametrize("command", ["build", "merge"])
+def test_little_memory_is_one_line(command: str, tmp_path: Path) -> None:
+    """With an address space in which the libraries crash or hang, the command says so before it loads them."""
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (500_000_000, 500_000_000))
+
+    code = f"from tsdf.cli.{command} import main; main()"
+    words = [sys.executable, "-c", code, "cube", "--out", str(tmp_path / "x.exr")]
+    done = subprocess.run(words, preexec_fn=limit, capture_output=True, text=True)
+    assert done.returncode == 1 and done.stderr == f"tsdf-{command}: error: not enough memory\n"

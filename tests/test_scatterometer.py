@@ -264,6 +264,11 @@ def test_part_files_that_lie_are_refused(octahedron: Grain, tmp_path: Path) -> N
             values[place] = value
         return arrays | {name: values}
 
+    def text(name: str, before: str, after: str) -> np.ndarray:
+        stored = arrays[name].tobytes().decode()
+        assert before in stored
+        return np.frombuffer(stored.replace(before, after).encode(), np.uint8)
+
     theta = np.argwhere(arrays["theta"][0] > 0)[0, 0]
     lies = {
         "chunk numbers of another type": changed("done", None, arrays["done"].astype(float)),
@@ -276,6 +281,9 @@ def test_part_files_that_lie_are_refused(octahedron: Grain, tmp_path: Path) -> N
         "sums that overflow": changed("box", (0, 0, 0, 0, 0), 2**62),
         "a mean cosine of 2": changed("scalars", (0, T.COS_THETA), 2 * arrays["scalars"][0, T.SCATTERED]),
         "a record of nothing": changed("records", (0, 0, 3), math.nan),
+        "a request of other types": changed("request", None, text("request", '"cells": 256', '"cells": 256.0')),
+        "more records than there are": changed("request", None, text("request", '"joint": 1', '"joint": 9')),
+        "a judgement that never comes": changed("request", None, text("request", '"judgement": 8', '"judgement": -8')),
         "another type": changed("cells", None, arrays["cells"].astype(np.int32)),
         "another shape": changed("cells", None, arrays["cells"][1:]),
         "one array more": arrays | {"more": np.zeros(3)},

@@ -12,12 +12,14 @@ from dataclasses import dataclass
 from queue import SimpleQueue
 
 from tsdf import tally as T
+from tsdf.files import need_memory
 from tsdf.grains import Grain
 from tsdf.optics import Optics
 from tsdf.tally import Tally
 from tsdf.tracer import Tracer, in_order
 
 PIECE = 1024  # paths that are worth a thread
+THREAD_BYTES = 200_000_000  # of address space that a thread, its ray engine and its heap ask for, tallies apart
 
 
 @dataclass
@@ -56,12 +58,13 @@ class Crew:
         self, grain: Grain, optics: Optics, seed: int, max_bounces: int, joint: int, memory: int, threads: int,
         reflectance_scale: float = 1.0,
     ) -> None:  # fmt: skip
+        self._sides = [[Tally(joint, memory) for _ in range(threads)] for _ in range(2)]
+        first = self._sides[0][0]
+        need_memory(threads * (THREAD_BYTES + 2 * sum(counts.nbytes for counts in first.arrays().values())))
         self._tracers = [
             Tracer(grain, optics.eta, optics.fresnel, seed, max_bounces, reflectance_scale=reflectance_scale)
             for _ in range(threads)
         ]
-        self._sides = [[Tally(joint, memory) for _ in range(threads)] for _ in range(2)]
-        first = self._sides[0][0]
         self._tracers[0].trace(in_order(0, T.REPLICATES), first)  # compiles what is not compiled yet
         first.clear()
         self._idle: SimpleQueue[int] = SimpleQueue()

@@ -1,5 +1,6 @@
-"""Writing a file whole or not at all."""
+"""Writing a file whole or not at all; whether there is room in memory for what is to come."""
 
+import mmap
 import os
 import secrets
 from collections.abc import Iterator
@@ -36,3 +37,23 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise TSDFError(
             f"cannot write {os.fspath(path)}: {reason}; check the folder, the permissions and the free space"
         ) from error
+
+
+def need_memory(size: int) -> None:
+    """Refuse what will not fit, before a library that cannot say so crashes: Embree does.
+
+    Parameters
+    ----------
+    size : int
+        Bytes of address space that are about to be asked for.
+
+    Raises
+    ------
+    MemoryError
+    """
+    if os.name != "posix":
+        return
+    try:  # nothing can be written there, so it costs nothing
+        mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=0).close()
+    except OSError:
+        raise MemoryError from None

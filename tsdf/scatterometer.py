@@ -173,6 +173,9 @@ def printable(text: str) -> str:
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
+GRAIN = {"kind", "name", "parameters", "notes"}  # what is asked of a grain that a part file describes
+
+
 def grain_header(grain: Grain) -> dict[str, Any]:
     """Return the header's account of a grain."""
     return {
@@ -423,8 +426,8 @@ class Build:
 
         # in a thread of its own, so that no signal finds counts half added or a file half written
         worker = threading.Thread(target=work, daemon=True)
-        worker.start()
         try:
+            worker.start()
             while worker.is_alive():
                 worker.join(0.1)
                 if report is not None:
@@ -433,6 +436,8 @@ class Build:
             leave.set()
             worker.join(2.0 * ROUND_S)
             raise
+        if outcome and "start new thread" in str(outcome[0]):
+            raise MemoryError from outcome[0]
         if outcome:
             raise outcome[0]
 
@@ -535,11 +540,11 @@ class Build:
                 f"{self.effort.max_bounces} bounces, more than {MAX_LEAK:g}: raise --max-bounces"
             )
 
-    def falls_short(self) -> str | None:
+    def falls_short(self, part: tuple[int, int] = (1, 1)) -> str | None:
         """Return what is not as asked for, None if nothing is: paths that are missing, a target that is not met."""
-        target, asked, paths = self.effort.target_error, self.effort.paths or 0, self.paths
-        if paths < asked:
-            return f"{paths} of {asked} paths are done"
+        target, paths = self.effort.target_error, self.paths
+        if target is None and (missing := size(without(self._wanted(part), self.done))):
+            return f"{paths} of {paths + missing} paths are done"
         error = self.error() if target is not None else None
         if error is not None and target is not None and error.total_variation > target:
             return f"the target error {target:g} is not met after {paths} paths, {error.total_variation:.2g} is"
@@ -625,9 +630,14 @@ class Build:
             spans = [(int(first), int(last)) for first, last in done]
             if joined(spans) != spans or any(not 0 <= first < last <= MAX_PATHS for first, last in spans):
                 raise ValueError("done")
+            effort, judgement = request["effort"], request["judgement"]
+            whole = [judgement, *(value for key, value in effort.items() if key != "target_error")]
+            if any(type(value) is not int for value in whole if value is not None) or not 0 <= judgement <= MAX_PATHS:
+                raise ValueError("effort")
+            if effort["joint"] > joint or effort["memory"] > memory or not request["grain"].keys() >= GRAIN:
+                raise ValueError("effort")
             build = cls(
-                request["grain"], Optics(**request["optics"]), Effort(**request["effort"]), Tally(joint, memory), spans,
-                int(request["judgement"]),
+                request["grain"], Optics(**request["optics"]), Effort(**effort), Tally(joint, memory), spans, judgement,
             )  # fmt: skip
             mine = build.tally.arrays()
             if mine.keys() != arrays.keys():
