@@ -24,6 +24,7 @@ from tsdf.tally import Tally
 LEGENDRE = 16  # highest Legendre moment in the header
 MIN_CELLS, MAX_CELLS = 8, T.COARSE
 HAZE = 0.3  # share of the noise that a cell width may be too large by
+NEAR = 1.3  # errors an octave of cells beside the least are no larger than so many times it
 STATISTICS = (
     "hit_probability",
     "albedo",
@@ -183,40 +184,55 @@ class TableErrors:
         hidden = 2.4 * max(0.0, widths[-1] - widths[-2]) if len(widths) > 1 else 0.0
         return TableError(cells, float(noise * math.sqrt(0.5 / (math.pi * replicates))), widths[-1] + hidden)
 
+    def rough(self) -> TableError:
+        """Return the least error of candidates an octave apart, from the finest on to where errors rise again."""
+        best = self(self._candidates[-1])
+        for cells in self._candidates[-9::-8]:
+            error = self(cells)
+            if error.total_variation > NEAR * best.total_variation:
+                break
+            best = min(best, error, key=lambda e: e.total_variation)
+        return best
+
     def best(self) -> TableError:
-        """Return the least error of all candidates: of those an octave apart, then of ever nearer neighbours."""
-        steps = [8, 4, 2, 1] if len(self._candidates) > 1 else [1]
-        tried = range(0, len(self._candidates), steps[0])
-        for step in steps:
-            best = min(tried, key=lambda i: self(self._candidates[i]).total_variation)
-            tried = range(max(0, best - step // 2), min(len(self._candidates), best + step // 2 + 1), max(1, step // 2))
+        """Return the least error: that of ever nearer neighbours of the best of `rough`."""
+        last, best = len(self._candidates) - 1, self._candidates.index(self.rough().cells)
+        for step in (4, 2, 1):
+            best = min((i for i in (best - step, best, best + step) if 0 <= i <= last), key=self._variation)
         return self(self._candidates[best])
 
     def fewest(self, target: float) -> TableError | None:
         """Return the error of the fewest cells that meet a target, by bisection, or None if none does."""
-        best = self.best()
-        if best.total_variation > target:
+        if self.rough().total_variation > NEAR * target or self.best().total_variation > target:
             return None
-        low, high = -1, self._candidates.index(best.cells)
+        low, high = -1, self._candidates.index(self.best().cells)
         while high - low > 1:
             middle = (low + high) // 2
-            if self(self._candidates[middle]).total_variation <= target:
+            if self._variation(middle) <= target:
                 high = middle
             else:
                 low = middle
         return self(self._candidates[high])
 
-    def needed(self, target: float) -> float:
-        """Return how many times as many paths will meet a target, for noise falls as their root; infinity if none.
+    def _variation(self, candidate: int) -> float:
+        return self(self._candidates[candidate]).total_variation
 
-        What the cells cost counts as it shows now, less the noise that may show as width.
+    def needed(self, target: float) -> tuple[float, float]:
+        """Return how many times as many paths will meet a target, at least and about; infinity if none will.
+
+        Noise falls as the root of their number; cells cost what they seem to, or less: noise may show as width.
         """
-        self.best()
-        rooms = [(error.sampling_noise, target - error.cell_width) for error in self._known.values()]
-        if factors := [(noise / room) ** 2 for noise, room in rooms if room > 0.0]:
-            return min(factors)
-        hopeless = all(-room > HAZE * noise for noise, room in rooms)
-        return math.inf if hopeless else max((noise / target) ** 2 for noise, _ in rooms)
+        self.rough()
+
+        def times(haze: float) -> float:
+            rooms = [
+                (error.sampling_noise, target - max(0.0, error.cell_width - haze * error.sampling_noise))
+                for error in self._known.values()
+            ]
+            return min(((noise / room) ** 2 for noise, room in rooms if room > 0.0), default=math.inf)
+
+        least, most = times(HAZE), times(0.0)
+        return least, math.sqrt(least * most) if math.isfinite(most) else least
 
 
 def _width(theta: np.ndarray, cells: int, parts: int) -> tuple[float, float]:
@@ -224,12 +240,14 @@ def _width(theta: np.ndarray, cells: int, parts: int) -> tuple[float, float]:
     replicates = len(theta)
     edges = bounds(cells, T.FINE)
     cuts = np.append(np.rint(np.linspace(edges[:-1], edges[1:], parts, endpoint=False)).astype(int).T.ravel(), T.FINE)
-    masses = np.add.reduceat(theta, cuts[:-1], axis=1).reshape(replicates, cells, parts)
+    deviations = np.add.reduceat(theta, cuts[:-1], axis=1).reshape(replicates, cells, parts)
     share = np.diff(-np.cos(cuts * (math.pi / T.FINE))).reshape(cells, parts)
     share /= share.sum(axis=1, keepdims=True)  # the density of the table is uniform in cos theta within a column
-    deviations = masses - masses.sum(axis=2, keepdims=True) * share
-    variances = deviations.var(axis=0, ddof=1) / replicates
-    squares = deviations.mean(axis=0) ** 2 - variances
+    deviations -= np.add.reduceat(theta, edges[:-1], axis=1)[:, :, None] * share
+    mean = deviations.mean(axis=0)
+    deviations -= mean
+    variances = np.square(deviations, out=deviations).sum(axis=0) / ((replicates - 1) * replicates)
+    squares = mean**2 - variances
     # the noise of a square is known and subtracted: part by part in columns that clearly deviate, which leaves a
     # little too much elsewhere, so there over a window of columns if that leaves less
     alone = np.sqrt(np.maximum(squares, 0.0)).sum(axis=1)

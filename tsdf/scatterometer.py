@@ -359,18 +359,18 @@ class Build:
         if not self.tally.scalars[:, T.SCATTERED].all():
             return False
         errors = estimate.TableErrors(self.tally, self.effort.cells)
-        progress.error = errors.fewest(target) or errors.best()
+        progress.error = errors.fewest(target) or errors.rough()
         if progress.error.total_variation <= target:
             progress.total = paths
             return True
-        needed = errors.needed(target) * paths
+        least, needed = (times * paths for times in errors.needed(target))
         sure = progress.error.sampling_noise < 0.5 * target
-        if math.isinf(needed) or (sure and needed > REASONABLE):
+        if math.isinf(least) or (sure and least > REASONABLE):
             finest = errors(self.effort.cells or estimate.MAX_CELLS)
             more = "allow more --cells, or give" if self.effort.cells else "give"
             raise UsageError(
                 f"--target-error {target:g} is out of reach"
-                + (f" of {REASONABLE:.0e} paths" if math.isfinite(needed) else "")
+                + (f" of {REASONABLE:.0e} paths" if math.isfinite(least) else "")
                 + f": {finest.cells} cells of theta alone cost {finest.cell_width:.2g} of total variation; {more} a "
                 "larger --target-error, or --paths"
             )
@@ -499,7 +499,7 @@ class Build:
                 if target is not None and self.paths >= self.judgement and without(self._wanted(part), self.done) == []:
                     if self._judge_and_save(progress, part_file):
                         break
-                elif tell:
+                elif tell and target is None:
                     progress.error = self.error()
                 self.check_leaks()
                 if part_file is not None and now - saved > SAVE_S:
