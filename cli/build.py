@@ -1,20 +1,23 @@
 """``tsdf-build``: a grain in, a table out."""
 
+import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from tsdf.cli.common import Progress, Tool, check_numbers, check_output, plain, say, shown_progress
-from tsdf.cli.start import interruptible
+from tsdf.cli.start import interrupt_status, interruptible
 from tsdf.errors import GrainError, TSDFError, UsageError
 
 if TYPE_CHECKING:
     from tsdf.scatterometer import Progress as Done
+    from tsdf.table import Table
 
+LONG_S = 600.0  # [s] what takes longer deserves a note
 DEFAULT_MATERIAL, DEFAULT_WAVELENGTH_NM = "ice", 550.0
 
 
@@ -64,22 +67,26 @@ def _setting(context: click.Context, parameter: click.Parameter, values: tuple[s
     return settings
 
 
-def told(progress: "Progress", target: float | None) -> Callable[["Done"], None]:
-    """Return what tells a progress bar of a build: paths, their rate, current error, and how far that is."""
+def told(progress: Progress, target: float | None) -> Callable[["Done"], None]:
+    """Return what tells a progress bar of a build: paths, their rate, the error reached; and notes if it takes long."""
     begun: list[float] = []
+    noted: list[bool] = []
 
     def tell(done: "Done") -> None:
         begun[:] = begun or [time.monotonic(), done.paths]
-        total = done.total
-        words = [
-            f"{done.paths:.3g} paths, {(done.paths - begun[1]) / max(time.monotonic() - begun[0], 1e-9):.2g} paths/s"
-        ]
+        seconds, paths = time.monotonic() - begun[0], done.paths - begun[1]
+        words = [f"{done.paths:.3g} paths, {paths / max(seconds, 1e-9):.2g} paths/s"]
         if done.error is not None:
-            words.append(f"total variation {done.error:.2g}, {done.cells} cells")
-            if target is not None and done.paths:
-                # noise falls as the square root of the paths: a guess of how many the target takes
-                total = int(done.paths * max(1.0, done.error / target) ** 2)
-        progress(done.paths / total if total else 0.0, ", ".join(words))
+            goal = f" of {target:g}" if target is not None else ""
+            words.append(f"total variation {done.error.total_variation:.2g}{goal}, {done.error.cells} cells")
+        progress(done.paths / done.total if done.total else 0.0, ", ".join(words))
+        left = seconds * (done.total - done.paths) / paths if done.total and paths else 0.0
+        if target is not None and seconds > 5.0 and left > LONG_S and not noted:
+            noted.append(True)
+            progress.note(
+                f"--target-error {target:g} takes about {done.total:.1e} paths, {left / 60:.0f} minutes more; "
+                "--max-seconds S ends in time, and what Ctrl-C interrupts is kept"
+            )
 
     return tell
 
@@ -96,7 +103,13 @@ def told(progress: "Progress", target: float | None) -> Callable[["Done"], None]
     help="A parameter of a built-in grain; --grains lists them. May be given several times.",
 )
 @click.option("--eta", type=float, help="Relative refractive index n_inside / n_outside.  [default: ice at 550 nm]")
-@click.option("--material", help="ice, water, quartz, salt, glass or sucrose, in air.")
+@click.option(
+    "--material",
+    metavar="NAME|FILE",
+    help="Built in, in air: ice and water (200 to 4000 nm), quartz (198 to 2053.1), salt (200 to 30000), glass "
+    "(N-BK7, 300 to 2500), sucrose (400 to 700). Or a file of your own: lines of wavelength_nm,n,k under that header "
+    "(.csv), or an entry of refractiveindex.info (.yml).",
+)
 @click.option(
     "--wavelength-nm", type=float, help=f"Wavelength for --material [nm].  [default: {DEFAULT_WAVELENGTH_NM:g}]"
 )
@@ -110,6 +123,12 @@ def told(progress: "Progress", target: float | None) -> Callable[["Done"], None]
 @click.option("--traced", is_flag=True, help="Send the exact sphere through the Monte Carlo tracer, too.")
 @click.option("--paths", callback=_count, metavar="N", help="Paths to trace.  [default: 4e6]")
 @click.option("--target-error", type=float, metavar="E", help="Stop at this estimated total variation of p_theta.")
+@click.option(
+    "--max-seconds",
+    type=click.FloatRange(0.0),
+    metavar="S",
+    help="Stop tracing after S seconds and write the table as good as it got; --resume goes on all the same.",
+)
 @click.option("--cells", callback=_count, metavar="N", help="Cells of theta.  [default: 256, or what the target needs]")
 @click.option(
     "--joint", callback=_count, default="0", metavar="K", show_default=True, help="Joint records per cell of theta."
@@ -139,7 +158,12 @@ def told(progress: "Progress", target: float | None) -> Callable[["Done"], None]
 @click.option("--repair", is_flag=True, help="Try to close an open mesh, and say what that changed.")
 @click.option("--repair-any", is_flag=True, help="As --repair, even if more than a tenth of the surface is new.")
 @click.option("--chunk", "part", callback=_part, metavar="i/n", help="Trace part i of n only; --out is for tsdf-merge.")
-@click.option("--resume", is_flag=True, help="Go on with an interrupted build of the same command.")
+@click.option(
+    "--resume",
+    is_flag=True,
+    help="Go on from the part file of an interrupted build of the same grain, optics and --seed; any --paths, "
+    "--target-error and --cells, --max-seconds 0 for the table as good as it got.",
+)
 @click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
 @click.option(
     "--grains",
@@ -160,6 +184,7 @@ def main(
     traced: bool,
     paths: int | None,
     target_error: float | None,
+    max_seconds: float | None,
     cells: int | None,
     joint: int,
     memory: int,
@@ -171,7 +196,7 @@ def main(
     part: tuple[int, int] | None,
     resume: bool,
     quiet: bool,
-) -> None:
+) -> int:
     """Build the table of GRAIN: "sphere", a built-in grain (see --grains), or a mesh file."""
     if eta is not None and material is not None:
         raise UsageError("give --eta or --material, not both")
@@ -181,8 +206,8 @@ def main(
     if traced and grain != "sphere":
         raise UsageError("--traced is for the exact sphere; every other grain is traced anyway")
     exact = grain == "sphere" and not traced
-    if exact and (part is not None or resume or paths is not None):
-        raise UsageError("the exact sphere takes no paths, chunks or resuming; add --traced to trace it")
+    if exact and (part is not None or resume or paths is not None or max_seconds is not None):
+        raise UsageError("the exact sphere takes no paths, chunks, seconds or resuming; add --traced to trace it")
     if part is not None and target_error is not None:
         raise UsageError("parts cannot know when the whole meets a target: give --paths with --chunk")
     if (repair or repair_any) and grain == "sphere":
@@ -192,23 +217,27 @@ def main(
     from tsdf.optics import Optics
 
     if eta is None:
-        from tsdf.materials import optical_constants
+        from tsdf.constants import constants_of
 
-        found = optical_constants(
+        found = constants_of(
             material or DEFAULT_MATERIAL, DEFAULT_WAVELENGTH_NM if wavelength_nm is None else wavelength_nm
         )
         optics = Optics(found.n, fresnel, found.material, found.wavelength_nm, found.k, found.source)
+        if found.k is not None and found.k > 0.01 and not quiet:
+            click.echo(
+                f"note: k is {found.k:.2g}: the reflectance of so dark a surface is taken as if k were 0", err=True
+            )
     else:
         optics = Optics(eta, fresnel)
     effort = scatterometer.Effort(paths, target_error, cells, joint, seed, max_bounces, memory)
     part_file = out if part is not None else out.with_name(out.name + ".part")
-    check_output(out, Path(grain), beside=[] if exact or part is not None else [part_file])
+    inputs = [Path(grain), *([Path(material)] if material else [])]
+    check_output(out, *inputs, beside=[] if exact or part is not None else [part_file])
     if not exact and part_file.exists() and not resume:
         if part is not None:
             raise TSDFError(f"{part_file} exists already: add --resume to go on with it, or choose another --out")
         raise TSDFError(f"{part_file} holds an unfinished build: add --resume to go on with it, or delete it")
 
-    from tsdf.format import write
     from tsdf.grains import load_grain
 
     shape = load_grain(grain, repair="any" if repair_any else repair, **settings)
@@ -217,59 +246,81 @@ def main(
             click.echo(f"note: {note}", err=True)
     if exact:
         finish(scatterometer.exact_sphere(shape, optics, effort), out, quiet)
-        return
+        return 0
 
     build = scatterometer.Build.start(shape, optics, effort)
     if resume and part_file.exists():
-        stored = scatterometer.Build.load(part_file)
-        if stored.request != build.request:
-            differing = ", ".join(key for key in build.request if build.request[key] != stored.request.get(key))
-            raise TSDFError(f"{part_file} is of another build (they differ in {differing}): delete it to start anew")
-        build = stored
+        build.take(scatterometer.Build.load(part_file), plain(part_file))
+        if not quiet and build.paths > (paths or build.paths):
+            click.echo(f"note: {plain(part_file)} holds {build.paths} paths already, and all are used", err=True)
 
-    def interrupted() -> str:
-        safe = f"{build.paths} paths are safe in {plain(part_file)}; go on with --resume"
-        return safe if build.done and part_file.exists() else "nothing is done yet"
+    def meaning() -> str | None:
+        return None if build.done else "nothing is done yet"
 
-    with interruptible(interrupted):
-        try:
+    try:
+        with interruptible(meaning, raises=True):
             with shown_progress(quiet) as progress:
                 build.run(
-                    shape, threads or os.cpu_count() or 1, part or (1, 1), part_file, told(progress, target_error)
-                )
-            table = build.table() if part is None else None
-        except (GrainError, UsageError):
-            part_file.unlink(missing_ok=True)  # a refused build cannot be gone on with
-            raise
-        if table is not None:
-            write(table, out)
-    if part is not None:
-        if not quiet:
-            say(f"{out}: part {part[0]} of {part[1]}, {build.paths} paths; tsdf-merge makes the table")
-        return
-    part_file.unlink(missing_ok=True)
-    summary(table, out, quiet)
+                    shape, threads or os.cpu_count() or 1, part or (1, 1), part_file,
+                    None if quiet else told(progress, target_error),
+                    max_seconds=math.inf if max_seconds is None else max_seconds,
+                )  # fmt: skip
+            table = build.table(as_it_got=max_seconds is not None) if part is None else None
+    except KeyboardInterrupt:
+        click.echo(
+            f"tsdf-build: error: interrupted: {build.paths} paths are safe in {plain(part_file)}; go on with --resume, "
+            "or with --resume --max-seconds 0 for the table as good as it got",
+            err=True,
+        )
+        return interrupt_status()
+    except GrainError:
+        part_file.unlink(missing_ok=True)  # a refused grain cannot be gone on with
+        raise
+    except UsageError as error:
+        raise UsageError(
+            f"{error}; its {build.paths} paths are kept in {plain(part_file)}: --resume goes on with them, "
+            "--resume --max-seconds 0 makes the table as good as it got"
+        ) from None
+    if table is not None:
+        finish(table, out, quiet)
+    elif part is not None and not quiet:
+        say(f"{plain(out)}: part {part[0]} of {part[1]}, {build.paths} paths; tsdf-merge makes the table")
+    if short := build.falls_short(part or (1, 1)):
+        click.echo(f"note: {short}; {plain(part_file)} is kept: --resume goes on", err=True)
+    elif part is None:
+        part_file.unlink(missing_ok=True)
+    return 0
 
 
-def finish(table: Any, out: Path, quiet: bool) -> None:
-    """Write a finished table and sum it up."""
+def finish(table: "Table", out: Path, quiet: bool) -> None:
+    """Write a finished table and sum it up on standard output."""
     from tsdf.format import write
 
     write(table, out)
-    summary(table, out, quiet)
-
-
-def summary(table: Any, out: Path, quiet: bool) -> None:
-    """Sum a table up on standard output."""
     ledger = table.header["energy_ledger"]
     leak = (ledger["lost"] + ledger["truncated"]) / ledger["launched"]
     if leak > 1e-6:
         click.echo(f"warning: {leak:.1e} of the light was lost or cut off: see energy in tsdf-info", err=True)
     if quiet:
         return
-    s, errors = table.statistics, table.header["standard_errors"]
-    error = table.header["table_error"]
-    say(f"{out}: {table.header['grain']['name']}, eta {table.header['optics']['eta']:.6g}")
+    say(f"{plain(out)}: {plain(table.header['grain']['name'])}")
+    for line in summary(table):
+        say(line)
+
+
+def summary(table: "Table") -> Iterator[str]:
+    """Yield the lines that sum a finished table up."""
+    grain, optics, error = table.header["grain"], table.header["optics"], table.header["table_error"]
+    s, errors, ledger = table.statistics, table.header["standard_errors"], table.header["energy_ledger"]
+    made_of = f", {plain(optics['material'])} at {optics['wavelength_nm']:g} nm" if optics["material"] else ""
+    yield f"  {'eta':40s}{optics['eta']:.6g}{made_of}"
+    if grain["kind"] == "mesh":
+        unit = "unit of the file" if not grain["parameters"] and "." in grain["name"] else "as built in"
+        yield f"  {'bounding radius R':40s}{grain['bounding_radius']:.6g} ({unit})"
+        bodies = f", {grain['bodies']} bodies" if grain["bodies"] > 1 else ""
+        yield f"  {'shape':40s}{grain['faces']} facets, {'convex' if grain['convex'] else 'not convex'}{bodies}"
+        filled = grain["volume"] / (4.0 / 3.0 * math.pi)
+        yield f"  {'share of the bounding sphere it fills':40s}{filled:.4f}"
     for label, name in (
         ("hit probability beta", "hit_probability"),
         ("mean cosine g", "mean_cosine"),
@@ -279,9 +330,11 @@ def summary(table: Any, out: Path, quiet: bool) -> None:
         ("mean path length [R]", "mean_path_length"),
         ("forward atom", "atom_forward"),
     ):
-        say(f"  {label:40s}{s[name]:.6f} +- {errors[name]:.1e}")
-    say(
+        yield f"  {label:40s}{s[name]:.6f} +- {errors[name]:.1e}"
+    if paths := table.header["provenance"]["paths"]:
+        yield f"  {'paths, cells of theta':40s}{paths}, {len(table.p_theta) - 2}"
+    yield (
         f"  {'total variation to the truth, about':40s}{error['total_variation']:.2g} "
         f"(noise {error['sampling_noise']:.2g}, cells {error['cell_width']:.2g})"
     )
-    say(f"  {'light lost or cut off':40s}{leak:.1e}")
+    yield f"  {'light lost or cut off':40s}{(ledger['lost'] + ledger['truncated']) / ledger['launched']:.1e}"

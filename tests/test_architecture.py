@@ -25,6 +25,8 @@ LAYERS = [
         "materials",
         "table",
         "tally",
+        "archive",
+        "constants",
         "analytic",
         "exemplars",
         "surface",
@@ -43,6 +45,7 @@ LAYERS = [
     },
     {"grains", "format", "estimate", "horizon", "neighbours", "sampler", "scene"},
     {"tracer", "exact", "geometry"},
+    {"crew"},
     {"scatterometer", "validate", "plots", "explicit", "walker"},
     {"memory"},
     {"transport"},
@@ -62,6 +65,7 @@ DOORS = {
     "PIL": {"image"},
     "matplotlib": {"plots"},
     "jsonschema": {"container"},
+    "yaml": {"constants"},
 }
 
 

@@ -2,6 +2,7 @@
 
 import os
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from click.testing import CliRunner, Result
 import tsdf
 from tsdf.cli import common
 from tsdf.cli.build import main as build
+from tsdf.cli.build import told
 from tsdf.cli.merge import main as merge
 
 FAST = ["--eta", "1.31", "--paths", "10000", "--quiet"]
@@ -71,15 +73,76 @@ def test_material_is_recorded(tmp_path: Path) -> None:
 
 
 def test_progress_and_summary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where no terminal shows a bar, a line now and then says how far it is: here after each chunk."""
+    """Where no terminal shows a bar, a line now and then says how far it is: here at every look."""
     for name in ("EVERY_S", "LEAST_S"):
         monkeypatch.setattr(common, name, 0.0)
-    result = run("cube", "--eta", "1.31", "--paths", "20000", "--out", tmp_path / "c.exr")
+    result = run("cube", "--material", "ice", "--paths", "20000", "--out", tmp_path / "c.exr")
     assert result.exit_code == 0
     assert re.search(r"^100 %, 2e\+04 paths, .* paths/s, total variation .* cells \[0:\d\d\]$", result.stderr, re.M)
-    assert "light lost or cut off" in result.stdout
+    for line in ("light lost or cut off", "as built in", "12 facets, convex", "fills   0.3676", "1.311, ice at 550 nm"):
+        assert line in result.stdout
     quiet = run("cube", *FAST, "--out", tmp_path / "q.exr")
     assert quiet.exit_code == 0 and quiet.stdout == quiet.stderr == ""
+
+
+def test_progress_says_the_error_and_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it stands, the goal, and once, if it will take long, how long."""
+    from tsdf.estimate import TableError
+    from tsdf.scatterometer import Progress
+
+    class Recorder(common.Progress):
+        def __call__(self, share: float, word: str) -> None:
+            heard.append((share, word))
+
+        def note(self, text: str) -> None:
+            noted.append(text)
+
+    heard: list[tuple[float, str]] = []
+    noted: list[str] = []
+    tell = told(Recorder(), 0.01)
+    clock = iter((0.0, 0.0, 10.0, 20.0))
+    monkeypatch.setattr(time, "monotonic", lambda: next(clock))
+    tell(Progress())
+    for paths in (1000, 2000):
+        tell(Progress(paths, 10**6, 0, TableError(64, 0.02, 0.01)))
+    assert heard[0] == (0.0, "0 paths, 0 paths/s")
+    assert heard[2] == (0.002, "2e+03 paths, 1e+02 paths/s, total variation 0.03 of 0.01, 64 cells")
+    (note,) = noted
+    assert note.startswith("--target-error 0.01 takes about 1.0e+06 paths, 166 minutes more")
+
+
+def test_max_seconds_and_then_more(tmp_path: Path) -> None:
+    """The table as good as it got, the paths kept, and from them any other table."""
+    out = tmp_path / "x.exr"
+    words = ["cube", "--eta", "1.31", "--out", str(out)]
+    result = run(*words, "--target-error", "1e-3", "--max-seconds", "0")
+    assert result.exit_code == 0 and out.exists() and Path(f"{out}.part").exists()
+    assert "target error 0.001 is not met after" in result.stderr and "--resume goes on" in result.stderr
+    assert "total variation to the truth" in result.stdout
+    result = run(*words, "--target-error", "1e-5", "--resume", "--quiet")
+    assert result.exit_code == 2 and "out of reach" in one_line(result) and "are kept in" in result.stderr
+    assert Path(f"{out}.part").exists()
+    result = run(*words, "--target-error", "0.5", "--resume", "--quiet")
+    assert result.exit_code == 0 and not Path(f"{out}.part").exists()
+    assert tsdf.read(out).header["table_error"]["total_variation"] <= 0.5
+    part = ["cube", "--eta", "1.31", "--paths", "1e7", "--chunk", "1/2", "--out", tmp_path / "1.part"]
+    result = run(*part, "--max-seconds", "0")
+    assert (
+        result.exit_code == 0 and "of 4920960 paths are done" in result.stderr and "--resume goes on" in result.stderr
+    )
+    result = run("sphere", "--max-seconds", "1", "--out", tmp_path / "s.exr")
+    assert result.exit_code == 2 and "--traced" in one_line(result)
+
+
+def test_a_grain_whose_name_has_a_line_break(tmp_path: Path) -> None:
+    """Such a name is a file's right: it is escaped where a header has room for one line only."""
+    from tsdf.grains import load_grain
+
+    grain, path = load_grain("octahedron"), tmp_path / "o\n.obj"
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in grain.vertices.tolist()]
+    path.write_text("\n".join([*lines, *(f"f {a} {b} {c}" for a, b, c in (grain.faces + 1).tolist())]))
+    assert run(path, *FAST, "--out", tmp_path / "x.exr").exit_code == 0
+    assert tsdf.read(tmp_path / "x.exr").header["grain"]["name"] == "o\\n.obj"
 
 
 def test_grains_are_listed() -> None:
@@ -270,3 +333,17 @@ def test_an_unfinished_target_is_no_table(tmp_path: Path) -> None:
     result = CliRunner().invoke(merge, [str(tmp_path / "y.part"), "--out", str(tmp_path / "y.exr")])
     assert result.exit_code == 1 and "not met" in one_line(result)
     assert not (tmp_path / "y.exr").exists()
+
+
+@pytest.mark.parametrize("command", ["build", "merge"])
+def test_little_memory_is_one_line(command: str, tmp_path: Path) -> None:
+    """With an address space in which the libraries crash or hang, the command says so before it loads them."""
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (500_000_000, 500_000_000))
+
+    code = f"from tsdf.cli.{command} import main; main()"
+    words = [sys.executable, "-c", code, "cube", "--out", str(tmp_path / "x.exr")]
+    done = subprocess.run(words, preexec_fn=limit, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert re.fullmatch(rf"tsdf-{command}: error: not enough memory: ulimit -v is 476 MiB, .*\n", done.stderr)

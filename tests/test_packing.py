@@ -1,5 +1,6 @@
 """Packings: spheres that do not overlap and lie as fluids and glasses do; lines through them against brute force."""
 
+import io
 import math
 from itertools import product
 from pathlib import Path
@@ -10,6 +11,7 @@ from numba import njit
 from scipy.spatial import cKDTree
 from scipy.special import sph_harm_y
 
+from tsdf import archive
 from tsdf import packing as module
 from tsdf.errors import UsageError
 from tsdf.packing import MAX, Cells, Packing, cells_of, next_sphere, pack
@@ -370,11 +372,17 @@ def test_cache_keeps_and_heals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     damaged[len(whole) // 2] ^= 1
     overlapping = packing.centres.copy()
     overlapping[0] = overlapping[1]
-    for wrong in (b"", whole[:-100], bytes(damaged), b"PK" + b"\0" * 500, other.read_bytes(), overlapping, None):
-        if isinstance(wrong, bytes):
-            file.write_bytes(wrong)
-        else:
-            np.savez(file, centres=packing.centres[:5] if wrong is None else wrong, name=np.array(file.stem))
+    foreign = archive.read(other, 10_000)["centres"]  # a packing, but of another seed
+    grown = io.BytesIO()
+    np.savez_compressed(grown, centres=np.zeros((10**6, 3)), name=np.array(file.stem))
+    for wrong in (b"", whole[:-100], bytes(damaged), b"PK" + b"\0" * 500, other.read_bytes(), grown.getvalue()):
+        file.write_bytes(wrong)
+        assert pack(0.3, 64).centres.tobytes() == packing.centres.tobytes()
+        assert file.read_bytes() == whole
+    np.savez(file, centres=foreign, name=np.array(file.stem))
+    assert pack(0.3, 64).centres.tobytes() == packing.centres.tobytes()
+    for centres in (packing.centres[:5], overlapping, packing.centres.astype(np.float32)):
+        archive.write(file, {"centres": centres, "name": np.array(file.stem)})
         assert pack(0.3, 64).centres.tobytes() == packing.centres.tobytes()
         assert file.read_bytes() == whole
 

@@ -327,7 +327,7 @@ def _moments(eta: float, apart: bool, absorption: float) -> _Moments:
     if eta < 1:  # b > eta: all is reflected, and cos_theta = 2 b^2 - 1
         gap = 1 - eta * eta
         cosine = 1 - gap * (1 - _NODES)
-        legendre += gap / 2 * (legval(cosine, np.eye(LEGENDRE_ORDERS)) @ _WEIGHTS)
+        legendre += gap / 2 * (legval(cosine, np.eye(LEGENDRE_ORDERS)) * _WEIGHTS).sum(axis=1)
         orders[0] += gap
     albedo = float(legendre[0])
     return _Moments(albedo, z / albedo, length / albedo, np.array(orders), legendre / albedo)

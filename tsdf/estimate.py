@@ -2,7 +2,8 @@
 
 `columns_of` is where fine cells become the columns of a table; `traced_table` makes a `Table` of them, as
 `exact.exact_table` does without counts. Everything is a function of its arguments alone, so equal counts give equal
-bytes.
+bytes: on any processor and with any number of threads, for sums have a fixed order (`product`; numpy's own do, those of
+BLAS and LAPACK do not), and functions whose last digits depend on vector instructions are those of `math` (`each`).
 """
 
 import math
@@ -22,6 +23,8 @@ from tsdf.tally import Tally
 
 LEGENDRE = 16  # highest Legendre moment in the header
 MIN_CELLS, MAX_CELLS = 8, T.COARSE
+HAZE = 0.3  # share of the noise that a cell width may be too large by
+NEAR = 1.3  # errors an octave of cells beside the least are no larger than so many times it
 STATISTICS = (
     "hit_probability",
     "albedo",
@@ -35,6 +38,18 @@ STATISTICS = (
 )
 LICENCE = "CC0-1.0"
 SHIFT = (math.sqrt(5.0) - 1.0) / 2.0  # its multiples fall evenly into [0, 1)
+# What a statistic can be; sums of rounded numbers may miss it by their last digit
+RANGES = {
+    "hit_probability": (0.0, 1.0),
+    "albedo": (0.0, 1.0),
+    "mean_cosine": (-1.0, 1.0),
+    "mean_z": (-1.0, 2.0),
+    "mean_r": (0.0, 2.0),
+    "mean_miss_chord": (0.0, 2.0),
+    "mean_path_length": (0.0, math.inf),
+    "atom_forward": (0.0, 1.0),
+    "atom_backward": (0.0, 1.0),
+}
 
 
 @dataclass(frozen=True)
@@ -57,6 +72,19 @@ class TableError:
     def total_variation(self) -> float:
         """Their sum, an upper bound of what both do together."""
         return self.sampling_noise + self.cell_width
+
+
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the sums of (..., n) times (n, m), (..., m) float64, always added in the same order."""
+    out = np.zeros((*a.shape[:-1], b.shape[1]))
+    for k in range(len(b)):
+        out += a[..., k, None] * b[k]
+    return out
+
+
+def each(function: Callable[[float], float], values: np.ndarray) -> np.ndarray:
+    """Return a function of `math` of every element; the last digits of numpy's own depend on the processor."""
+    return np.array([function(value) for value in values.ravel().tolist()], dtype=np.float64).reshape(values.shape)
 
 
 def bounds(cells: int, fine: int) -> np.ndarray:
@@ -110,27 +138,101 @@ def jackknife(sums: np.ndarray, statistic: Callable[[np.ndarray], np.ndarray]) -
 
 
 def table_error(tally: Tally, cells: int) -> TableError:
-    """Estimate the total variation between p_theta in `cells` cells and the truth.
+    """Estimate the total variation between p_theta in `cells` cells and the truth; see `TableErrors`."""
+    return TableErrors(tally)(cells)
+
+
+class TableErrors:
+    """Estimates of the total variation between the truth and the tables of a tally, each made once, when asked for.
 
     The noise is the sum of the standard errors of the columns times sqrt(2 / pi), halved. The cell width shows in how
     parts of each column differ from what its mean density gives them (a linear density shows in full in two parts),
-    corrected for their own noise, in as many parts as the noise allows.
+    corrected for their own noise, in as many parts as the noise allows. So caustics narrower than a part come to light
+    only with more paths, and make the width grow.
+
+    Parameters
+    ----------
+    tally : Tally
+    cells : int, optional
+        The only number of cells that may be chosen; without it, any of `candidate_cells`.
     """
-    replicates = len(tally.theta)
-    theta = tally.theta * (replicates / tally.scalars[:, T.SCATTERED].sum())
-    noise = columns_of(theta, cells).std(axis=0, ddof=1).sum()
-    widths: list[float] = []
-    for parts in (2, 4, 8, 16):
-        if parts * cells > T.FINE:
-            break
-        width, blur = _width(theta[:, : T.FINE], cells, parts)
-        if widths and blur > 1.5 * width:
-            break
-        widths.append(width)
-    # what still finer parts would show: nothing where the density is smooth; at a caustic, whose cells deviate as the
-    # root of their width, the gains of ever finer parts add up to 2.4 times the last
-    hidden = 2.4 * max(0.0, widths[-1] - widths[-2]) if len(widths) > 1 else 0.0
-    return TableError(cells, float(noise * math.sqrt(0.5 / (math.pi * replicates))), widths[-1] + hidden)
+
+    def __init__(self, tally: Tally, cells: int | None = None) -> None:
+        self._theta = tally.theta * (len(tally.theta) / tally.scalars[:, T.SCATTERED].sum())
+        self._candidates = candidate_cells() if cells is None else [cells]
+        self._known: dict[int, TableError] = {}
+
+    def __call__(self, cells: int) -> TableError:
+        """Return the error in so many cells."""
+        if cells not in self._known:
+            self._known[cells] = self._estimate(cells)
+        return self._known[cells]
+
+    def _estimate(self, cells: int) -> TableError:
+        theta, replicates = self._theta, len(self._theta)
+        noise = columns_of(theta, cells).std(axis=0, ddof=1).sum()
+        widths: list[float] = []
+        for parts in (2, 4, 8, 16):
+            if parts * cells > T.FINE:
+                break
+            width, blur = _width(theta[:, : T.FINE], cells, parts)
+            if widths and blur > 1.5 * width:
+                break
+            widths.append(width)
+        # what still finer parts would show: nothing where the density is smooth; at a caustic, whose cells deviate as
+        # the root of their width, the gains of ever finer parts add up to 2.4 times the last
+        hidden = 2.4 * max(0.0, widths[-1] - widths[-2]) if len(widths) > 1 else 0.0
+        return TableError(cells, float(noise * math.sqrt(0.5 / (math.pi * replicates))), widths[-1] + hidden)
+
+    def rough(self) -> TableError:
+        """Return the least error of candidates an octave apart, from the finest on to where errors rise again."""
+        best = self(self._candidates[-1])
+        for cells in self._candidates[-9::-8]:
+            error = self(cells)
+            if error.total_variation > NEAR * best.total_variation:
+                break
+            best = min(best, error, key=lambda e: e.total_variation)
+        return best
+
+    def best(self) -> TableError:
+        """Return the least error: that of ever nearer neighbours of the best of `rough`."""
+        last, best = len(self._candidates) - 1, self._candidates.index(self.rough().cells)
+        for step in (4, 2, 1):
+            best = min((i for i in (best - step, best, best + step) if 0 <= i <= last), key=self._variation)
+        return self(self._candidates[best])
+
+    def fewest(self, target: float) -> TableError | None:
+        """Return the error of the fewest cells that meet a target, by bisection, or None if none does."""
+        if self.rough().total_variation > NEAR * target or self.best().total_variation > target:
+            return None
+        low, high = -1, self._candidates.index(self.best().cells)
+        while high - low > 1:
+            middle = (low + high) // 2
+            if self._variation(middle) <= target:
+                high = middle
+            else:
+                low = middle
+        return self(self._candidates[high])
+
+    def _variation(self, candidate: int) -> float:
+        return self(self._candidates[candidate]).total_variation
+
+    def needed(self, target: float) -> tuple[float, float]:
+        """Return how many times as many paths will meet a target, at least and about; infinity if none will.
+
+        Noise falls as the root of their number; cells cost what they seem to, or less: noise may show as width.
+        """
+        self.rough()
+
+        def times(haze: float) -> float:
+            rooms = [
+                (error.sampling_noise, target - max(0.0, error.cell_width - haze * error.sampling_noise))
+                for error in self._known.values()
+            ]
+            return min(((noise / room) ** 2 for noise, room in rooms if room > 0.0), default=math.inf)
+
+        least, most = times(HAZE), times(0.0)
+        return least, math.sqrt(least * most) if math.isfinite(most) else least
 
 
 def _width(theta: np.ndarray, cells: int, parts: int) -> tuple[float, float]:
@@ -138,32 +240,37 @@ def _width(theta: np.ndarray, cells: int, parts: int) -> tuple[float, float]:
     replicates = len(theta)
     edges = bounds(cells, T.FINE)
     cuts = np.append(np.rint(np.linspace(edges[:-1], edges[1:], parts, endpoint=False)).astype(int).T.ravel(), T.FINE)
-    masses = np.add.reduceat(theta, cuts[:-1], axis=1).reshape(replicates, cells, parts)
+    deviations = np.add.reduceat(theta, cuts[:-1], axis=1).reshape(replicates, cells, parts)
     share = np.diff(-np.cos(cuts * (math.pi / T.FINE))).reshape(cells, parts)
     share /= share.sum(axis=1, keepdims=True)  # the density of the table is uniform in cos theta within a column
-    deviations = masses - masses.sum(axis=2, keepdims=True) * share
-    variances = deviations.var(axis=0, ddof=1) / replicates
-    squares = deviations.mean(axis=0) ** 2 - variances
+    deviations -= np.add.reduceat(theta, edges[:-1], axis=1)[:, :, None] * share
+    mean = deviations.mean(axis=0)
+    deviations -= mean
+    variances = np.square(deviations, out=deviations).sum(axis=0) / ((replicates - 1) * replicates)
+    squares = mean**2 - variances
     # the noise of a square is known and subtracted: part by part in columns that clearly deviate, which leaves a
     # little too much elsewhere, so there over a window of columns if that leaves less
     alone = np.sqrt(np.maximum(squares, 0.0)).sum(axis=1)
-    window = np.ones(min(17, cells))
-    pooled = np.convolve(squares.mean(axis=1), window, "same") / np.convolve(np.ones(cells), window, "same")
+    pooled = _pooled(squares.mean(axis=1), min(17, cells))
     together = parts * np.sqrt(np.maximum(pooled, 0.0))
     clear = squares.sum(axis=1) > 3.0 * math.sqrt(2.0 / parts) * variances.sum(axis=1)
     width = 0.5 * np.where(clear, alone, np.minimum(alone, together)).sum()
     return float(width), float(np.sqrt(variances).sum() * math.sqrt(0.5 / math.pi))
 
 
+def _pooled(values: np.ndarray, window: int) -> np.ndarray:
+    """Return the mean of the values around each, as many as there are up to `window`."""
+    before = (window - 1) // 2
+    padded = np.pad(np.stack((values, np.ones(len(values)))), ((0, 0), (window - 1 - before, before)))
+    sums = np.zeros((2, len(values)))
+    for k in range(window):
+        sums += padded[:, k : k + len(values)]
+    return sums[0] / sums[1]
+
+
 def candidate_cells() -> list[int]:
     """Return the numbers of cells that an automatic choice tries, ascending, an eighth of an octave apart."""
     return sorted({round(2.0 ** (k / 8.0)) for k in range(24, 81)})
-
-
-def smallest_enough(tally: Tally, target: float) -> TableError | None:
-    """Return the error of the fewest cells that meet `target`, or None if none does."""
-    errors = (table_error(tally, cells) for cells in candidate_cells())
-    return next((error for error in errors if error.total_variation <= target), None)
 
 
 def legendre_matrix(edges: np.ndarray) -> np.ndarray:
@@ -234,14 +341,16 @@ def mutual_information(energy: np.ndarray) -> float:
         return 0.0
     p = energy / total
     group, a, b = p.sum(axis=(1, 2), keepdims=True), p.sum(axis=2, keepdims=True), p.sum(axis=1, keepdims=True)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        terms = p * np.log2(p * group / (a * b))
-    return float(np.nansum(terms))
+    lit = p > 0.0
+    terms = np.zeros(p.shape)
+    terms[lit] = p[lit] * each(math.log2, ratio(p * group, a * b)[lit])
+    return float(terms.sum())
 
 
 def _joint_variation(energy: np.ndarray) -> float:
     """Return the total variation between (groups, phi, r, z) and the product of its marginals given the group."""
-    p = energy / energy.sum()
+    total = energy.sum()
+    p = energy / total if total else energy
     group = p.sum(axis=(1, 2, 3), keepdims=True)
     given = ratio(p, group)
     product = given.sum(axis=(2, 3), keepdims=True) * given.sum(axis=(1, 3), keepdims=True)
@@ -272,7 +381,7 @@ def factorisation_error(
     r = (T.R_EDGES[:-1, None] + parts * (T.R_EDGES[1] - T.R_EDGES[0])).ravel()
     z = (T.Z_EDGES[:-1, None] + parts * (T.Z_EDGES[1] - T.Z_EDGES[0])).ravel()
     length = np.hypot(r[:, None], z[None, :])
-    density = (p_r * p_theta) @ p_z.T
+    density = product(p_r * p_theta, p_z.T)
     cells = density.repeat(4, axis=0).repeat(4, axis=1) / 16.0
     return {
         "mutual_information_bits": information,
@@ -452,18 +561,38 @@ def _calibrate(
         mean, spread = np.zeros(len(fields)), np.zeros((len(fields), len(fields)))
         for c in lit:
             x = (found[c][:, fields] - target) / unit
-            w = weights[c] * np.exp(x @ tilt)
+            w = weights[c] * each(math.exp, (x * tilt).sum(axis=1))
             w *= hit[c] / w.sum()
-            own = w @ x
+            own = (w[:, None] * x).sum(axis=0)
             mean += own
-            spread += (x * w[:, None]).T @ x - np.outer(own, own) / hit[c]
+            spread += (w[:, None, None] * x[:, :, None] * x[:, None, :]).sum(axis=0) - np.outer(own, own) / hit[c]
         if np.abs(mean).max() < 1e-9 * hit.sum():
             break
-        tilt = tilt - np.linalg.lstsq(spread, mean, rcond=1e-9)[0]
-        if not (np.abs(tilt) < 1.0).all():
+        tilt = tilt - _solution(spread, mean)
+        # weights that change by more than e^30 mean that a sample cannot have these means
+        if not ((np.abs(tilt) < 1.0).all() and (np.abs((every - target) / unit * tilt).sum(axis=1) < 30.0).all()):
             return
     for c in lit:
-        weights[c] = weights[c] * np.exp((found[c][:, fields] - target) / unit @ tilt)
+        weights[c] = weights[c] * each(math.exp, ((found[c][:, fields] - target) / unit * tilt).sum(axis=1))
+
+
+def _solution(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return x of matrix x = right for a small positive semi-definite matrix, 0 where it says nothing of x."""
+    matrix, x = matrix.copy(), right.copy()
+    least, left = 1e-9 * np.diag(matrix).max(), list(range(len(x)))
+    while left:
+        k = max(left, key=lambda i: matrix[i, i])
+        if not (matrix[k, k] > least):
+            break
+        left.remove(k)
+        x[k] /= matrix[k, k]
+        matrix[k] /= matrix[k, k]
+        for i in range(len(x)):
+            if i != k:
+                x[i] -= matrix[i, k] * x[k]
+                matrix[i] -= matrix[i, k] * matrix[k]
+    x[left] = 0.0
+    return x
 
 
 def _in_equal_cells(counts: np.ndarray, columns: int) -> np.ndarray:
@@ -474,7 +603,7 @@ def _in_equal_cells(counts: np.ndarray, columns: int) -> np.ndarray:
     before = places.astype(int)
     after = np.minimum(before + 1, counts.shape[-1])
     sums = running[..., before] + (places - before) * (running[..., after] - running[..., before])
-    return np.diff(sums, axis=-1)
+    return np.maximum(np.diff(sums, axis=-1), 0.0)
 
 
 def normalised(energy: np.ndarray) -> np.ndarray:
@@ -509,7 +638,18 @@ def assemble(
     ledger: Mapping[str, int],
     provenance: Mapping[str, Any],
 ) -> Table:
-    """Stack the blocks and write the header."""
+    """Stack the blocks and write the header, so that every rule of SPEC.md on values holds.
+
+    Sums of rounded numbers may put a mean beside its cell or a statistic beside its range, by no more than was
+    rounded: there they are put on the edge.
+    """
+    lower, upper = T.L_EDGES[:-1, None], np.append(T.L_EDGES[1:-1], math.inf)[:, None]
+    mean_l = np.where(conditionals["p_l"].astype(np.float32) > 0.0, np.clip(mean_l, lower, upper), 0.0)
+    statistics = (
+        statistics
+        | {name: min(max(statistics[name], low), high) for name, (low, high) in RANGES.items()}
+        | {"legendre_moments": [min(max(moment, -1.0), 1.0) for moment in statistics["legendre_moments"]]}
+    )
     axes = {
         "p_phi": ("phi_delta", "rad", T.PHI_EDGES),
         "p_r": ("r", "R", T.R_EDGES),
@@ -589,7 +729,9 @@ def traced_table(
     fine = np.concatenate(
         (tally.theta[:, T.FINE + 1 :], tally.theta[:, T.FINE - 1 :: -1], tally.theta[:, T.FINE : T.FINE + 1]), axis=1
     )
-    moments, moment_errors = jackknife(fine, lambda energy: ratio(energy @ matrix, energy.sum(axis=-1, keepdims=True)))
+    moments, moment_errors = jackknife(
+        fine, lambda energy: ratio(product(energy, matrix), energy.sum(axis=-1, keepdims=True))
+    )
     statistics: dict[str, Any] = dict(zip(STATISTICS, values[:-1].tolist(), strict=True))
     standard_errors: dict[str, Any] = dict(zip(STATISTICS, errors[:-1].tolist(), strict=True))
     moments[:2], moment_errors[:2] = (1.0, statistics["mean_cosine"]), (0.0, standard_errors["mean_cosine"])

@@ -25,6 +25,7 @@ from tsdf.estimate import (
     assemble,
     candidate_cells,
     cos_theta_edges,
+    each,
     normalised,
     ratio,
     systematic,
@@ -33,6 +34,7 @@ from tsdf.optics import Optics
 from tsdf.table import MEMORY_FIELDS, RECORD_FIELDS, Table
 
 LEDGER_UNITS = 1 << 52  # energy units of an exact table
+DARK = 1e-30  # a column of less is empty: its conditionals would be rounding errors
 
 
 @njit(cache=True)
@@ -105,7 +107,7 @@ def _exact_width(optics: Optics, cells: int) -> float:
     """Return the total variation between the exact p_theta and its cell means."""
     parts = 16
     edges = cos_theta_edges(cells)[1:-1]
-    theta = np.arccos(edges)
+    theta = each(math.acos, edges)
     fine = np.cos((theta[:-1, None] + np.diff(theta)[:, None] * np.arange(parts) / parts).ravel())
     fine = np.append(fine, 1.0)
     masses = analytic.deflection_masses(fine, optics.eta, optics.fresnel).reshape(cells, parts)
@@ -186,7 +188,8 @@ def exact_table(
         "p_l": with_atoms(spread(length, T.L)),
     }
     moments = with_atoms(spread(length, T.L, events.path_length))
-    dark = p_theta <= 0.0
+    dark = (p_theta < DARK) | (energy["p_l"].sum(axis=1) < DARK)
+    p_theta[dark] = 0.0
     conditionals = {name: np.where(dark, 0.0, normalised(values)) for name, values in energy.items()}
     mean_l = np.where(dark, 0.0, ratio(moments, energy["p_l"]).T)
 

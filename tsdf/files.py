@@ -1,4 +1,4 @@
-"""Writing a file whole or not at all, and finding out beforehand whether it can be written.
+"""Writing a file whole or not at all, and finding out beforehand whether it can be, and whether memory will do.
 
 A file is written under a hidden name beside its own, `.NAME.HEX.tmp`, then moved. Its writer holds a lock on it, which
 ends with the process, so that the next one to write NAME can tell what a killed process left and take it away.
@@ -6,6 +6,7 @@ ends with the process, so that the next one to write NAME can tell what a killed
 
 import contextlib
 import glob
+import mmap
 import os
 import re
 import secrets
@@ -159,3 +160,23 @@ def _temporary(target: Path) -> Iterator[Path]:
     finally:
         path.unlink(missing_ok=True)
         _open.discard(path)
+
+
+def need_memory(size: int) -> None:
+    """Refuse what will not fit, before a library that cannot say so crashes: Embree does.
+
+    Parameters
+    ----------
+    size : int
+        Bytes of address space that are about to be asked for.
+
+    Raises
+    ------
+    MemoryError
+    """
+    if os.name != "posix":
+        return
+    try:  # nothing can be written there, so it costs nothing
+        mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=0).close()
+    except OSError:
+        raise MemoryError from None

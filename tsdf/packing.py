@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tsdf import archive
 from tsdf.compiled import njit
 from tsdf.errors import TSDFError, UsageError
-from tsdf.files import replacing
 from tsdf.sampling import key_of, mix, unit
 from tsdf.vectors import KERNEL
 
@@ -336,11 +336,14 @@ def _folder() -> Path:
 
 
 def _cached(name: str, spheres: int, side: float) -> np.ndarray | None:
-    """Return the centres that are kept under a name, if they are there and are that packing."""
+    """Return the centres that are kept under a name, if they are there and are that packing.
+
+    The name says fraction, number and seed, and stands in the file under one digest with the centres.
+    """
     try:
-        with open(_folder() / f"{name}.npz", "rb") as file, np.load(file, allow_pickle=False) as kept:
-            centres, label = kept["centres"], str(kept["name"])
-    except Exception:  # a damaged archive raises whatever its first bad byte leads to, and is remade
+        kept = archive.read(_folder() / f"{name}.npz", limit=24 * spheres + 8192)
+        centres, label = kept["centres"], str(kept["name"])
+    except (OSError, ValueError, KeyError):  # not there or damaged: it is made
         return None
     if label != name or centres.shape != (spheres, 3) or centres.dtype != np.float64:
         return None
@@ -352,8 +355,7 @@ def _keep(name: str, centres: np.ndarray) -> None:
     try:
         folder = _folder()
         folder.mkdir(parents=True, exist_ok=True)
-        with replacing(folder / f"{name}.npz") as path, open(path, "wb") as file:
-            np.savez(file, centres=centres, name=np.array(name))
+        archive.write(folder / f"{name}.npz", {"centres": centres, "name": np.array(name)})
     except (OSError, TSDFError):  # the packing is made again next time
         pass
 

@@ -1,33 +1,35 @@
 """How a table is made: a grain, its optics and an effort in, a `Table` out.
 
-Paths are numbered and traced in chunks whose limits depend on nothing but the numbers, and all counts are integers
-that add up in any order, so the same request gives the same bytes for any number of threads, interrupted and resumed
-or not, in one piece or in parts merged afterwards. After each chunk the counts go to a part file beside the output.
+Paths are numbered, and all counts are integers that add up in any order, so the same request gives the same bytes for
+any number of threads, interrupted and resumed or not, in one piece or in parts merged afterwards. What counts is only
+which paths are done; the counts go to a part file beside the output every few seconds, and it serves whatever request
+they can answer. Whether a target is met is judged at numbers of paths that follow from the counts alone. `crew` has the
+threads.
 """
 
-import io
 import json
 import math
 import shlex
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tsdf import estimate
+from tsdf import archive, estimate
 from tsdf import tally as T
+from tsdf.crew import PIECE, Crew, Round
 from tsdf.errors import GrainError, TSDFError, UsageError
 from tsdf.exact import exact_table
-from tsdf.files import replacing
 from tsdf.grains import Grain
 from tsdf.optics import Optics
 from tsdf.table import Table
 from tsdf.tally import Tally
-from tsdf.tracer import MAX_BOUNCES, Tracer, in_order
+from tsdf.tracer import MAX_BOUNCES
 
 DEFAULT_PATHS = 4_000_000
 DEFAULT_CELLS = 256
@@ -36,7 +38,12 @@ MAX_PATHS = 1 << 36  # 6.9e10: 2^30 in each replicate, whose energy times path l
 MAX_JOINT = 1024
 MAX_LEAK = 1e-4  # share of the light that may be lost or cut off before a grain is refused
 CHUNK_MIN, CHUNK_MAX = 1 << 13, 1 << 20
-PART_VERSION = 2
+REASONABLE = 10**10  # paths that a target may take; a day of two processors
+ROUND_S, SAVE_S = 1.0, 5.0  # how long a round of the threads should last, and the least between two saves [s]
+PART_VERSION = 3
+PART_LIMIT = 1 << 28  # bytes of a part file; with all the records there can be it has 2e8
+
+Spans = list[tuple[int, int]]  # first and last + 1 path number of each, ascending, none touching the next
 
 
 @dataclass(frozen=True)
@@ -117,11 +124,63 @@ def chunks(paths: int | None) -> Iterator[tuple[int, int]]:
         first += size
 
 
+def joined(spans: Iterable[tuple[int, int]]) -> Spans:
+    """Return spans in order, those that touch as one."""
+    whole: Spans = []
+    for first, last in sorted(spans):
+        if whole and first <= whole[-1][1]:
+            whole[-1] = (whole[-1][0], max(last, whole[-1][1]))
+        else:
+            whole.append((first, last))
+    return whole
+
+
+def without(spans: Spans, done: Spans) -> Spans:
+    """Return what of `spans` is not in `done`."""
+    left, k = [], 0
+    for first, last in spans:
+        while k < len(done) and done[k][1] <= first:
+            k += 1
+        for begin, end in done[k:]:
+            if begin >= last:
+                break
+            if begin > first:
+                left.append((first, begin))
+            first = max(first, end)
+        if first < last:
+            left.append((first, last))
+    return left
+
+
+def beginning(spans: Spans, paths: int) -> Spans:
+    """Return the first so many paths of `spans`."""
+    found = []
+    for first, last in spans:
+        if paths <= 0:
+            break
+        found.append((first, min(last, first + paths)))
+        paths -= last - first
+    return found
+
+
+def size(spans: Iterable[tuple[int, int]]) -> int:
+    """Return how many paths there are."""
+    return sum(last - first for first, last in spans)
+
+
+def printable(text: str) -> str:
+    """Return text from outside as one line that a header can hold; file names may have line breaks in them."""
+    return text if text.isprintable() else ascii(text)[1:-1]
+
+
+GRAIN = {"kind", "name", "parameters", "notes"}  # what is asked of a grain that a part file describes
+
+
 def grain_header(grain: Grain) -> dict[str, Any]:
     """Return the header's account of a grain."""
     return {
         "kind": grain.kind,
-        "name": grain.name,
+        "name": printable(grain.name),
         "parameters": dict(grain.parameters),
         "bounding_radius": float(grain.bounding_radius),
         "area": float(grain.area),
@@ -130,17 +189,17 @@ def grain_header(grain: Grain) -> dict[str, Any]:
         "bodies": max(1, int(grain.bodies)),
         "faces": len(grain.faces),
         "mesh_sha256": grain.mesh_hash or None,
-        "notes": list(grain.notes),
+        "notes": [printable(note)[:1000] for note in grain.notes[:256]],
     }
 
 
 def canonical_command(grain: Mapping[str, Any], optics: Optics, effort: Effort, traced: bool) -> str:
-    """Return the command that makes the same table: no paths of this machine, no threads, no chunks."""
+    """Return the command that makes the same table: no paths of this machine, no threads, no chunks, no target."""
     words = ["tsdf-build", shlex.quote(grain["name"])]
     words += ["--repair"] if any(note.startswith("repair") for note in grain["notes"]) else []
     words += [f"--set {key}={value}" for key, value in grain["parameters"].items()]
     if optics.material is not None:
-        words += [f"--material {optics.material}", f"--wavelength-nm {optics.wavelength_nm!r}"]
+        words += [f"--material {shlex.quote(optics.material)}", f"--wavelength-nm {optics.wavelength_nm!r}"]
     else:
         words += [f"--eta {optics.eta!r}"]
     words += [f"--fresnel {optics.fresnel}"] if grain["kind"] == "sphere" else []
@@ -177,23 +236,29 @@ def exact_sphere(grain: Grain, optics: Optics, effort: Effort) -> Table:
 
 @dataclass
 class Progress:
-    """How far a build has come."""
+    """How far a build has come.
+
+    Attributes
+    ----------
+    paths : int
+        Paths done.
+    total : int, optional
+        Paths that it will take; with a target, as far as can be told.
+    rays : int
+        Rays traced since `Build.run` began.
+    error : TableError, optional
+        Of the table that would be made now.
+    """
 
     paths: int = 0
-    rays: int = 0
     total: int | None = None
-    error: float | None = None
-    cells: int | None = None
-
-    def at(self, error: estimate.TableError | None) -> "Progress":
-        """Take note of the error reached and return self."""
-        self.error, self.cells = (error.total_variation, error.cells) if error else (None, None)
-        return self
+    rays: int = 0
+    error: estimate.TableError | None = None
 
 
 @dataclass(eq=False)
 class Build:
-    """A table in the making: what was asked for, the chunks done and their counts.
+    """A table in the making: what was asked for, the paths done and their counts.
 
     Parameters
     ----------
@@ -202,15 +267,20 @@ class Build:
     optics : Optics
     effort : Effort
         Resolved.
-    done : set of int
-        Numbers of the chunks whose paths are in `tally`.
+    tally : Tally
+        Holds as many records as the effort asks for, or more.
+    done : list of (int, int)
+        The paths that are in `tally`.
+    judgement : int
+        Number of paths at which it is judged next whether the target is met.
     """
 
     grain: dict[str, Any]
     optics: Optics
     effort: Effort
     tally: Tally
-    done: set[int] = field(default_factory=set)
+    done: Spans = field(default_factory=list)
+    judgement: int = CHUNK_MIN
 
     @classmethod
     def start(cls, grain: Grain, optics: Optics, effort: Effort) -> "Build":
@@ -224,61 +294,90 @@ class Build:
         return cls(grain_header(grain), optics, effort, Tally(joint=effort.joint, memory=effort.memory))
 
     @property
-    def request(self) -> dict[str, Any]:
-        """What decides the result: equal requests give equal tables."""
+    def origin(self) -> dict[str, Any]:
+        """What decides what the paths are; they serve every request of the same origin."""
         return {
             "part_version": PART_VERSION,
             "software": estimate.software(),
             "grain": self.grain,
             "optics": asdict(self.optics),
-            "effort": asdict(self.effort),
+            "seed": self.effort.seed,
+            "max_bounces": self.effort.max_bounces,
         }
 
     @property
     def paths(self) -> int:
         """Number of paths done."""
-        return sum(last - first for k, (first, last) in self._numbered() if k in self.done)
+        return size(self.done)
 
-    def _numbered(self) -> Iterator[tuple[int, tuple[int, int]]]:
-        last = max(self.done, default=-1)
-        for k, limits in enumerate(chunks(self.effort.paths)):
-            if self.effort.paths is None and k > last:
-                return
-            yield k, limits
+    def take(self, stored: "Build", name: str = "the part file") -> None:
+        """Go on from the paths of another build, of which this one asks perhaps for other cells, paths or target.
+
+        Raises
+        ------
+        TSDFError
+            If they cannot answer this request; the message says what they can.
+        """
+        mine, other = self.origin, stored.origin
+        differing = [key.replace("_", "-") for key in mine if mine[key] != other[key]]
+        for kind in ("joint", "memory"):
+            if getattr(self.effort, kind) > getattr(stored.tally, kind):
+                differing.append(f"--{kind} {getattr(self.effort, kind)}")
+        if differing:
+            raise TSDFError(
+                f"{name} holds {stored.paths} paths of another build (they differ in {', '.join(differing)}): its own "
+                f"grain, optics, --seed and --max-bounces with any --paths, --cells or --target-error, --joint up to "
+                f"{stored.tally.joint} and --memory up to {stored.tally.memory} can go on with it; to start anew, "
+                f"delete it or choose another --out"
+            )
+        self.tally, self.done = stored.tally, stored.done
+        same = (self.effort.target_error, self.effort.cells) == (stored.effort.target_error, stored.effort.cells)
+        self.judgement = stored.judgement if same else 0
 
     def error(self) -> estimate.TableError | None:
-        """Return the error of the table that would be made now; with a target and no fixed cells, at its best."""
-        if not self.tally.scalars[:, T.SCATTERED].all():
+        """Return the error of the table that would be made now, with the cells it would have."""
+        if not self.tally.scalars[:, T.SCATTERED].any():
             return None
         if self.effort.cells is not None:
             return estimate.table_error(self.tally, self.effort.cells)
         assert self.effort.target_error is not None
-        found = estimate.smallest_enough(self.tally, self.effort.target_error)
-        if found is not None:
-            return found
-        errors = (estimate.table_error(self.tally, cells) for cells in estimate.candidate_cells()[::4])
-        return min(errors, key=lambda error: error.total_variation)
+        errors = estimate.TableErrors(self.tally)
+        return errors.fewest(self.effort.target_error) or errors.best()
 
-    def met(self, error: estimate.TableError | None) -> bool:
-        """Tell whether the target is met, or refuse one that never can be.
+    def _judge(self, progress: Progress) -> bool:
+        """Tell whether the target is met, and if not, choose when to ask again: never so late that much is wasted.
 
         Raises
         ------
         UsageError
-            If the cells alone cost more than the target and more paths cannot help.
+            If more paths cannot help, or unreasonably many would be needed.
         """
-        target = self.effort.target_error
-        if target is None or error is None:
+        target, paths = self.effort.target_error, self.paths
+        assert target is not None
+        following = next(last for _, last in chunks(None) if last > paths)
+        self.judgement = following
+        if not self.tally.scalars[:, T.SCATTERED].all():
             return False
-        if error.total_variation <= target:
+        errors = estimate.TableErrors(self.tally, self.effort.cells)
+        progress.error = errors.fewest(target) or errors.rough()
+        if progress.error.total_variation <= target:
+            progress.total = paths
             return True
-        finest = estimate.table_error(self.tally, self.effort.cells or estimate.MAX_CELLS)
-        if finest.cell_width > 1.5 * target and finest.sampling_noise < 0.5 * target:
+        least, needed = (times * paths for times in errors.needed(target))
+        sure = progress.error.sampling_noise < 0.5 * target
+        if math.isinf(least) or (sure and least > REASONABLE):
+            finest = errors(self.effort.cells or estimate.MAX_CELLS)
+            more = "allow more --cells, or give" if self.effort.cells else "give"
             raise UsageError(
-                f"--target-error {target:g} is out of reach: {finest.cells} cells of theta alone cost "
-                f"{finest.cell_width:.2g} of total variation; "
-                + ("allow more --cells" if self.effort.cells else "give a larger --target-error, or --paths")
+                f"--target-error {target:g} is out of reach"
+                + (f" of {REASONABLE:.0e} paths" if math.isfinite(least) else "")
+                + f": {finest.cells} cells of theta alone cost {finest.cell_width:.2g} of total variation; {more} a "
+                "larger --target-error, or --paths"
             )
+        progress.total = int(max(needed, following))
+        # halfway to where the target should be met, and not above four times as far, for what is seen early may mislead
+        halfway = min(paths + 0.5 * (needed - paths), 4.0 * paths)
+        self.judgement = next(last for _, last in chunks(None) if last > paths and last >= halfway)
         return False
 
     def run(
@@ -289,98 +388,147 @@ class Build:
         part_file: Path | None = None,
         report: Callable[[Progress], None] | None = None,
         reflectance_scale: float = 1.0,
+        max_seconds: float = math.inf,
     ) -> None:
-        """Trace the chunks that are not done, saving the counts to `part_file` after each.
+        """Trace the paths that are not done, saving the counts to `part_file` every few seconds and at the end.
+
+        An interrupt lets the threads finish what they are at, for a second at most, and saves it.
 
         Parameters
         ----------
         threads : int
-            Threads that share each chunk.
+            Threads that trace.
         part : (int, int)
             Only chunks i, i + n, ... of n parts, counting from 1.
         report : callable
-            Called after each chunk.
+            Called after each round.
         reflectance_scale : float
             Makes a wrong tracer, to test the tests, see `tracer.Tracer`.
+        max_seconds : float
+            Stop when so much time has passed, with what is done by then; if nothing is, after the first few paths.
 
         Raises
         ------
         GrainError
             If the grain loses more than MAX_LEAK of the light, told once enough paths are done to be sure.
+        UsageError
+            If the target is out of reach.
         """
-        tracers = [
-            Tracer(
-                grain,
-                self.optics.eta,
-                self.optics.fresnel,
-                self.effort.seed,
-                self.effort.max_bounces,
-                reflectance_scale=reflectance_scale,
-            )
-            for _ in range(threads)
-        ]
-        tallies = [Tally(joint=self.effort.joint, memory=self.effort.memory) for _ in range(threads)]
-        tracers[0].trace(in_order(0, T.REPLICATES), tallies[0])  # compiles what is not compiled yet
-        tallies[0].clear()
-        stop = threading.Event()
-        numbered = enumerate(chunks(self.effort.paths)) if self.effort.paths is not None else ()
-        mine = sum(last - first for k, (first, last) in numbered if k % part[1] == part[0] - 1)
-        progress = Progress(self.paths, 0, mine or None)
-        if part_file is not None and mine == 0 and self.effort.paths is not None:
-            self.save(part_file)  # more parts than chunks: this one is empty, but there
-        error = self.error() if self.done else None
-        if report is not None:
-            report(progress.at(error))
-        if self.met(error):
-            return
-        with ThreadPoolExecutor(threads) as pool:
+        progress, leave = Progress(self.paths), threading.Event()
+        outcome: list[BaseException] = []
+
+        def work() -> None:
             try:
-                for k, (first, last) in enumerate(chunks(self.effort.paths)):
-                    if k in self.done or k % part[1] != part[0] - 1:
-                        continue
-                    shares = np.array_split(in_order(first, last), threads)
-                    jobs = [
-                        pool.submit(tracer.trace, share, tally, stop)
-                        for tracer, share, tally in zip(tracers, shares, tallies, strict=True)
-                    ]
-                    progress.rays += sum(job.result() for job in jobs)
-                    for tally in tallies:
-                        self.tally.add(tally)
-                        tally.clear()
-                    self.done.add(k)
-                    if part_file is not None:
-                        self.save(part_file)
-                    progress.paths += last - first
-                    error = self.error() if report is not None or self.effort.target_error is not None else None
-                    if report is not None:
-                        report(progress.at(error))
-                    self.check_leaks(doubt=4.0)
-                    if self.met(error):
-                        return
-            except BaseException:
-                stop.set()
-                raise
-        if self.effort.target_error is not None:
-            raise TSDFError(
-                f"--target-error {self.effort.target_error:g} was not met after {MAX_PATHS:.2g} paths: give more"
-            )
+                self._work(grain, threads, part, part_file, progress, report is not None, reflectance_scale,
+                           time.monotonic() + max_seconds, leave)  # fmt: skip
+            except BaseException as error:
+                outcome.append(error)
 
-    def check_leaks(self, doubt: float = 0.0) -> None:
+        # in a thread of its own, so that no signal finds counts half added or a file half written
+        worker = threading.Thread(target=work, daemon=True)
+        try:
+            worker.start()
+            while worker.is_alive():
+                worker.join(0.1)
+                if report is not None:
+                    report(progress)
+        except BaseException:
+            leave.set()
+            worker.join(2.0 * ROUND_S)
+            raise
+        if outcome and "start new thread" in str(outcome[0]):
+            raise MemoryError from outcome[0]
+        if outcome:
+            raise outcome[0]
+
+    def _wanted(self, part: tuple[int, int]) -> Spans:
+        """Return the paths that are to be done before anything is judged."""
+        paths = self.effort.paths
+        if part != (1, 1):
+            return [span for k, span in enumerate(chunks(paths)) if k % part[1] == part[0] - 1]
+        if paths is None:
+            paths = self.judgement
+        return [(0, max([paths, *(last for _, last in self.done)]))]
+
+    def _work(
+        self, grain: Grain, threads: int, part: tuple[int, int], part_file: Path | None, progress: Progress,
+        tell: bool, reflectance_scale: float, deadline: float, leave: threading.Event,
+    ) -> None:  # fmt: skip
+        """Trace in rounds of about ROUND_S, two of them under way, until all is done, met, too late or left."""
+        target = self.effort.target_error
+        if target is None:
+            progress.total = size(self._wanted(part))
+        whole = without(self._wanted(part), self.done) == []
+        late = bool(self.done) and deadline <= time.monotonic()
+        if late or (whole and (target is None or self._judge_and_save(progress, part_file))):
+            progress.error = self.error() if tell and not progress.error else progress.error
+            if part_file is not None:
+                self.save(part_file)
+            return
+        effort, saved, length, pace = self.effort, -math.inf, CHUNK_MIN, 0.0
+        crew = Crew(grain, self.optics, effort.seed, effort.max_bounces, self.tally.joint, self.tally.memory, threads,
+                    reflectance_scale)  # fmt: skip
+        with crew:
+            under_way: deque[Round] = deque()
+            ahead, before = self.done, time.monotonic()
+            while True:
+                while len(under_way) < 2 and not leave.is_set():
+                    wanted = self._wanted(part)
+                    if target is not None and wanted == ahead:  # while the target is judged
+                        wanted = [(0, next(last for _, last in chunks(None) if last > self.judgement))]
+                    left = (deadline - time.monotonic()) * pace - sum(size(one.pieces.values()) for one in under_way)
+                    most = int(min(length, left)) if pace and math.isfinite(left) else length
+                    if not (spans := beginning(without(wanted, ahead), most)) or (most < length and most < PIECE):
+                        break
+                    under_way.append(crew.start(spans))
+                    ahead = joined([*ahead, *spans])
+                if not under_way:
+                    break
+                under_way[0].wait(leave)
+                finished = crew.dismiss(under_way, ROUND_S) if leave.is_set() else [under_way.popleft()]
+                for one in finished:
+                    spans, rays = crew.gather(one, self.tally)
+                    self.done = joined([*self.done, *spans])
+                    progress.rays += rays
+                progress.paths, now = self.paths, time.monotonic()
+                if leave.is_set():
+                    break
+                pace = size(spans) / max(now - before, 1e-6)
+                length = 2 * length if now - before < 0.5 * ROUND_S and size(spans) == length else length
+                before = now
+                if target is not None and self.paths >= self.judgement and without(self._wanted(part), self.done) == []:
+                    if self._judge_and_save(progress, part_file):
+                        break
+                elif tell and target is None:
+                    progress.error = self.error()
+                self.check_leaks()
+                if part_file is not None and now - saved > SAVE_S:
+                    self.save(part_file)
+                    saved = time.monotonic()
+        if part_file is not None:
+            self.save(part_file)
+
+    def _judge_and_save(self, progress: Progress, part_file: Path | None) -> bool:
+        """Tell whether the target is met; what is done is safe even if it is out of reach."""
+        try:
+            return self._judge(progress)
+        except UsageError:
+            if part_file is not None:
+                self.save(part_file)
+            raise
+
+    def check_leaks(self) -> None:
         """Refuse a grain whose tracing loses too much light.
-
-        Parameters
-        ----------
-        doubt : float
-            Standard errors, of rare whole paths, by which it must be too much.
 
         Raises
         ------
         GrainError
-            If more than MAX_LEAK of the light launched was lost at the surface or cut off by the bounce limit.
+            If the light that was lost at the surface or cut off by the bounce limit is more than MAX_LEAK of what was
+            launched by four standard errors, of rare whole paths.
         """
         sums = self.tally.scalars.astype(object).sum(axis=0)
         launched, lost, cut = sums[T.LAUNCHED], sums[T.LOST], sums[T.TRUNCATED]
-        limit = MAX_LEAK * launched + doubt * math.sqrt(MAX_LEAK * launched / T.UNIT) * T.UNIT
+        limit = MAX_LEAK * launched + 4.0 * math.sqrt(MAX_LEAK * launched / T.UNIT) * T.UNIT
         if lost > limit:
             raise GrainError(
                 f"{self.grain['name']}: {lost / launched:.2g} of the light was lost at the surface, more than "
@@ -392,32 +540,50 @@ class Build:
                 f"{self.effort.max_bounces} bounces, more than {MAX_LEAK:g}: raise --max-bounces"
             )
 
-    def table(self) -> Table:
+    def falls_short(self, part: tuple[int, int] = (1, 1)) -> str | None:
+        """Return what is not as asked for, None if nothing is: paths that are missing, a target that is not met."""
+        target, paths = self.effort.target_error, self.paths
+        if target is None and (missing := size(without(self._wanted(part), self.done))):
+            return f"{paths} of {paths + missing} paths are done"
+        error = self.error() if target is not None else None
+        if error is not None and target is not None and error.total_variation > target:
+            return f"the target error {target:g} is not met after {paths} paths, {error.total_variation:.2g} is"
+        return None
+
+    def table(self, as_it_got: bool = False) -> Table:
         """Return the finished table.
+
+        Parameters
+        ----------
+        as_it_got : bool
+            Whether fewer paths than asked for, or a target that is not met, will do.
 
         Raises
         ------
         TSDFError
-            If chunks are missing.
+            If paths are missing, or no light at all was scattered.
         """
-        if self.effort.paths is not None:
-            missing = [k for k, _ in enumerate(chunks(self.effort.paths)) if k not in self.done]
-            if missing:
-                raise TSDFError(
-                    f"{len(missing)} of {len(missing) + len(self.done)} chunks are missing: give all the parts"
-                )
+        paths = self.paths
+        missing = without([(0, max([self.effort.paths or 0, *(last for _, last in self.done)]))], self.done)
+        if not paths or self.done[0] != (0, paths) or (missing and not as_it_got):
+            what = f"{size(missing)} paths of {size(missing) + paths} are missing" if missing else "no paths are done"
+            raise TSDFError(f"{what}: go on with --resume, or give all the parts to tsdf-merge, whole")
         self.check_leaks()
         error = self.error()
-        if error is None or (self.effort.target_error is not None and not self.met(error)):
-            raise TSDFError("the target error is not met yet: go on with --resume")
+        if error is None:
+            raise TSDFError(f"none of {paths} paths was scattered by the grain: trace more (--paths), or look at it")
+        if not as_it_got and (short := self.falls_short()):
+            raise TSDFError(f"{short}: go on with --resume, or with --max-seconds 0 for the table as good as it got")
+        made = replace(self.effort, paths=paths, target_error=None, cells=error.cells)
         provenance = {
             "method": "traced",
-            "command": canonical_command(self.grain, self.optics, self.effort, traced=True),
-            "seed": self.effort.seed,
-            "paths": self.paths,
-            "max_bounces": self.effort.max_bounces,
+            "command": canonical_command(self.grain, self.optics, made, traced=True),
+            "seed": made.seed,
+            "paths": paths,
+            "max_bounces": made.max_bounces,
         }
-        return estimate.traced_table(self.tally, error.cells, self.grain, self.optics, provenance, self.effort.memory)
+        tally = self.tally.narrowed(made.joint, made.memory)
+        return estimate.traced_table(tally, error.cells, self.grain, self.optics, provenance, made.memory)
 
     def save(self, path: Path) -> None:
         """Write the part file, atomically.
@@ -427,14 +593,13 @@ class Build:
         TSDFError
             If it cannot be written; the file that stood there is left as it was.
         """
-        request = np.frombuffer(json.dumps(self.request).encode(), dtype=np.uint8)
-        arrays: dict[str, Any] = {
-            "request": request,
-            "done": np.array(sorted(self.done), dtype=np.int64),
-            **self.tally.arrays(),
+        request = json.dumps({**self.origin, "effort": asdict(self.effort), "judgement": self.judgement})
+        kept: dict[str, np.ndarray] = {
+            "request": np.frombuffer(request.encode(), dtype=np.uint8),
+            "done": np.array(self.done, dtype=np.int64).reshape(-1, 2),
+            "records_kept": np.array([self.tally.joint, self.tally.memory], dtype=np.int64),
         }
-        with replacing(path) as temporary, temporary.open("wb") as file:
-            np.savez(file, **arrays)
+        archive.write(path, kept | self.tally.arrays())
 
     @classmethod
     def load(cls, path: Path) -> "Build":
@@ -446,32 +611,62 @@ class Build:
             If it is missing, damaged, or of another version of this software.
         """
         try:
-            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as stored:
-                arrays = {name: stored[name] for name in stored.files}
+            arrays = archive.read(path, PART_LIMIT)
             request = json.loads(arrays.pop("request").tobytes())
+            if (request["part_version"], request["software"]) != (PART_VERSION, estimate.software()):
+                made = printable(str(request["software"]))[:100]
+                raise TSDFError(f"{path}: made by another version ({made}): build it again")
+            kept, done = arrays.pop("records_kept"), arrays.pop("done")
+            if (
+                kept.shape != (2,)
+                or done.ndim != 2
+                or done.shape[1] != 2
+                or {kept.dtype, done.dtype} != {np.dtype(np.int64)}
+            ):
+                raise ValueError("done")
+            joint, memory = (int(k) for k in kept)
+            if not (0 <= joint <= MAX_JOINT and 0 <= memory <= MAX_JOINT):
+                raise ValueError("records_kept")
+            spans = [(int(first), int(last)) for first, last in done]
+            if joined(spans) != spans or any(not 0 <= first < last <= MAX_PATHS for first, last in spans):
+                raise ValueError("done")
+            effort, judgement = request["effort"], request["judgement"]
+            whole = [judgement, *(value for key, value in effort.items() if key != "target_error")]
+            if any(type(value) is not int for value in whole if value is not None) or not 0 <= judgement <= MAX_PATHS:
+                raise ValueError("effort")
+            if effort["joint"] > joint or effort["memory"] > memory or not request["grain"].keys() >= GRAIN:
+                raise ValueError("effort")
             build = cls(
-                request["grain"],
-                Optics(**request["optics"]),
-                Effort(**request["effort"]),
-                Tally(joint=request["effort"]["joint"], memory=request["effort"]["memory"]),
-                {int(k) for k in arrays.pop("done")},
-            )
-            if request != json.loads(json.dumps(build.request)):
-                raise TSDFError(f"{path}: made by another version ({request.get('software')}): build it again")
-            for name, mine in build.tally.arrays().items():
-                if arrays[name].shape != mine.shape or arrays[name].dtype != mine.dtype:
+                request["grain"], Optics(**request["optics"]), Effort(**effort), Tally(joint, memory), spans, judgement,
+            )  # fmt: skip
+            mine = build.tally.arrays()
+            if mine.keys() != arrays.keys():
+                raise ValueError("arrays")
+            for name, values in mine.items():
+                if arrays[name].shape != values.shape or arrays[name].dtype != values.dtype:
                     raise ValueError(name)
-                mine[...] = arrays[name]
+                values[...] = arrays[name]
+            build.tally.check(build._launched())
         except FileNotFoundError:
             raise TSDFError(f"{path}: no such file") from None
         except OSError as error:
             raise TSDFError(f"{path}: {error.strerror or error}") from None
-        except TSDFError:
+        except (TSDFError, MemoryError) as error:
+            if isinstance(error, UsageError):
+                raise TSDFError(f"{path}: {error}") from None
             raise
-        except Exception as error:  # whatever zip, npy and json readers make of a damaged file
+        except Exception as error:  # whatever a damaged header leads to
             reason = "not a whole part file of tsdf-build --chunk or of an interrupted build"
             raise TSDFError(f"{path}: {reason}: give another, or build this part again") from error
         return build
+
+    def _launched(self) -> np.ndarray:
+        """Return how many of the paths done each replicate has, (REPLICATES,) int64."""
+        numbers = np.arange(T.REPLICATES)
+        return sum(
+            ((last - numbers + T.REPLICATES - 1) // T.REPLICATES - (first - numbers + T.REPLICATES - 1) // T.REPLICATES
+             for first, last in self.done), np.zeros(T.REPLICATES, np.int64)
+        )  # fmt: skip
 
 
 def merge(paths: list[Path]) -> Build:
@@ -480,17 +675,18 @@ def merge(paths: list[Path]) -> Build:
     Raises
     ------
     TSDFError
-        If they are of different requests or share chunks.
+        If they are of different requests or share paths.
     """
     whole = Build.load(paths[0])
     for path in paths[1:]:
         other = Build.load(path)
-        if other.request != whole.request:
-            differing = ", ".join(key for key in whole.request if whole.request[key] != other.request[key])
+        mine, its = ({**build.origin, **asdict(build.effort)} for build in (whole, other))
+        if its != mine:
+            differing = ", ".join(key.replace("_", "-") for key in mine if mine[key] != its[key])
             raise TSDFError(f"{path}: a part of another build than {paths[0]} (they differ in {differing})")
-        shared = other.done & whole.done
+        shared = size(other.done) - size(without(other.done, whole.done))
         if shared:
-            raise TSDFError(f"{path}: {len(shared)} of its chunks are in another part already: give each part once")
+            raise TSDFError(f"{path}: {shared} of its paths are in another part already: give each part once")
         whole.tally.add(other.tally)
-        whole.done |= other.done
+        whole.done = joined([*whole.done, *other.done])
     return whole

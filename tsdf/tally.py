@@ -139,6 +139,62 @@ class Tally:
                 both = np.concatenate((mine, getattr(other, name)), axis=1)
                 setattr(self, name, smallest(both, mine.shape[1]))
 
+    def narrowed(self, joint: int, memory: int) -> "Tally":
+        """Return the tally of the same paths that would have kept so many records, at most as many as this one.
+
+        The smallest of the smallest keys are the smallest of all, so nothing tells it from one that was counted so.
+        """
+        narrow = Tally(joint, memory, *(getattr(self, f) for f in ("scalars", "theta", "cells", "box", "box_l")))
+        if narrow.joint:
+            narrow.records = smallest(self.records, narrow.joint + 1)
+        if narrow.memory:
+            narrow.entry, narrow.entry_records = self.entry, smallest(self.entry_records, narrow.memory + 1)
+        return narrow
+
+    def check(self, launched: np.ndarray) -> None:
+        """Refuse counts that no tracer can have made; for those that come from a file.
+
+        Parameters
+        ----------
+        launched : (REPLICATES,) int64
+            Paths of each replicate that were traced.
+
+        Raises
+        ------
+        ValueError
+        """
+        s = self.scalars
+        scattered = s[:, SCATTERED]
+        by_theta = np.concatenate(
+            (self.theta[:, :FINE].reshape(REPLICATES, COARSE, -1).sum(axis=2), self.theta[:, FINE:]), axis=1
+        )
+        unsigned = np.delete(s, (COS_THETA, MEAN_Z), axis=1)
+        for counts in (unsigned, self.theta, self.cells, self.box, self.box_l, self.entry):
+            _require(not counts.size or counts.min() >= 0, "negative counts")
+        _require((s[:, LAUNCHED] == UNIT * launched).all(), "other light than that of the paths")
+        _agree(s[:, [UNSCATTERED, SCATTERED, TRUNCATED, LOST]].T, s[:, LAUNCHED])
+        _agree(self.theta.T, scattered)
+        for name, ways in (("phi", 2), ("r", 2), ("z", 2), ("l", 1)):  # as it is and reversed
+            _agree(self.conditional(name).T, ways * by_theta.sum(axis=0))
+        _require(self.conditional("l_sum").sum() == s[:, PATH_LENGTH].sum(), "sums that do not agree")
+        for i, most in ((COS_THETA, 1), (MEAN_R, 2), (MEAN_Z, 2), (OFFSET, 2)):
+            _require((np.abs(s[:, i]) <= most * scattered).all(), "a mean out of its range")
+        _require((s[:, MISS_CHORD] <= 2 * s[:, UNSCATTERED]).all(), "a mean out of its range")
+        _require(self.box.sum(dtype=float) <= 2.01 * float(scattered.sum(dtype=float)), "too much in boxes")
+        if self.memory:
+            _agree(self.entry[0].reshape(-1, 1), s[:, LAUNCHED].sum())
+            _require((self.entry[1] <= self.entry[0]).all(), "more misses than rays")
+        cell = np.arange(COARSE)[:, None]
+        b2 = self.entry_records[:, :, -1]
+        _require(((b2 * COARSE >= cell - 1e-9) & (b2 * COARSE <= cell + 1.0 + 1e-9) | np.isinf(b2)).all(), "a record")
+        for records, angles, lengths in (
+            (self.records, (4, 7), (2, 5, 6)),
+            (self.entry_records, (3, 6), (4, 7, 8)),
+        ):
+            kept = records[records[:, :, 0] < np.inf]
+            _require(not np.isnan(records).any() and (kept[:, :2] > 0.0).all() and np.isfinite(kept).all(), "a record")
+            _require((np.abs(kept[:, angles]) <= np.pi + 1e-6).all() and (kept[:, lengths] >= 0.0).all(), "a record")
+
     def clear(self) -> None:
         """Forget everything."""
         for name, mine in self.arrays().items():
@@ -149,3 +205,14 @@ def smallest(records: np.ndarray, count: int) -> np.ndarray:
     """Return the `count` records of the smallest keys, (cells, count, RECORD), sorted by key within each cell."""
     order = np.argsort(records[:, :, 0], axis=1, kind="stable")[:, :count]
     return np.take_along_axis(records, order[:, :, None], axis=1)
+
+
+def _require(holds: bool | np.bool_, what: str) -> None:
+    if not holds:
+        raise ValueError(what)
+
+
+def _agree(parts: np.ndarray, whole: np.ndarray) -> None:
+    """Refuse (n, m) parts whose sums over n are not `whole`; float sums are there because they do not overflow."""
+    _require((parts.sum(axis=0, dtype=float) < 2.0**63).all(), "sums that are too large")
+    _require(np.array_equal(parts.sum(axis=0), np.broadcast_to(whole, parts.shape[1:])), "sums that do not agree")
