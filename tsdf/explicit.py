@@ -218,8 +218,8 @@ def nothing_packed(media: int, components: int) -> Packed:
     """Return grains for the levels that have none."""
     cells = Cells(1.0, 1, 0.0, np.zeros((0, 3)), np.zeros(2, np.int32), np.zeros(0, np.int32))
     arrays = Grains(
-        cells=(cells,) * max(media, 1),
-        centres=(np.zeros((0, 3)),) * max(media, 1),
+        cells=(cells,),  # one, whatever the number of media, which would be part of the type
+        centres=(np.zeros((0, 3)),),
         radius=np.ones(media),
         seed=np.zeros(media, np.uint64),
         share=np.ones(components),

@@ -60,6 +60,7 @@ BOUNCES = 500  # after which there is none; a hole of a thousandth of all surfac
 SLOW = 1e5  # grains met by a path, beyond which it is said how long that takes
 ENDLESS = 1e7  # beyond which a path takes seconds
 EVENTS_PER_SECOND = 1e7  # of one thread, about
+MAX_PACKED = 8  # media of the explicit level
 DARKEST = 1e-300  # albedo, so that it has a logarithm
 FARTHEST = 1e300  # free path where nothing deflects, finite so that 0 of it is 0
 LOOKS = 200  # pixels along each side through which it is looked whether the camera sees anything
@@ -261,7 +262,13 @@ def build(scene: Scene, level: str) -> World:
             f"{scene.name}: level explicit meets suns and small bright lights by chance alone: until many samples "
             "have, the picture is too dark and its variance does not tell; widen the sun or light by a smooth sky"
         )
-    grains = packed(scene, tables) if model == EXPLICIT else nothing_packed(len(scene.media), len(tables))
+    if model == EXPLICIT and len(scene.media) > MAX_PACKED:
+        raise SceneError(
+            f"{scene.name}: level explicit takes {MAX_PACKED} media at most, not {len(scene.media)}, for whose number "
+            "its kernels are compiled; join media, or take level teleport-memory"
+        )
+    single = model == EXPLICIT and scene.media
+    grains = packed(scene, tables) if single else nothing_packed(len(scene.media), len(tables))
     return World(
         scene=scene,
         level=level,
