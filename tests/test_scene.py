@@ -359,6 +359,8 @@ BROKEN = [  # (path, value, what the line says after the name of the scene)
     ("surface/0/reflectance", [0, 0, -1], "[[surface]] 1 (floor): number 3 of reflectance must be >= 0 and <= 1"),
     ("surface/0/shape/type", "slab", "[[surface]] 1 (floor), shape: type cannot be 'slab'; it is one of rectangle,"),
     ("surface/0/shape/v", [-2, 0, 0], "[[surface]] 1 (floor), shape: u and v span no area"),
+    ("surface/0/shape/u", [5e-324, 0, 0], "[[surface]] 1 (floor), shape: u and v must be at least 1e-12 long"),
+    ("medium/0/shape/high", [1, 1, 1e-300], "low must be at least 1e-12 below high, but in z it is 1e-300"),
     ("surface/0/shape/u", [0, 0, 0], "[[surface]] 1 (floor), shape: u and v span no area"),
 ]
 

@@ -606,6 +606,8 @@ def _check_box(box: Box, at: _Place) -> Box:
     for axis, low, high in zip("xyz", box.low, box.high, strict=True):
         if low >= high:
             at.fail(f"low must be below high, but in {axis} it is {low:g} against {high:g}")
+        if high - low < SMALLEST:
+            at.fail(f"low must be at least {SMALLEST:g} below high, but in {axis} it is {high - low:g}")
     return box
 
 
@@ -619,6 +621,8 @@ def _check_rectangle(rectangle: Rectangle, at: _Place) -> Rectangle:
     u, v = _direction(rectangle.u), _direction(rectangle.v)
     if u is None or v is None or _parallel(u, v):
         at.fail("u and v span no area; they are the half edges, not zero and not parallel")
+    if min(math.hypot(*rectangle.u), math.hypot(*rectangle.v)) < SMALLEST:
+        at.fail(f"u and v must be at least {SMALLEST:g} long")
     return rectangle
 
 
