@@ -4,7 +4,7 @@ Only the file types in `READERS` are opened, only regular files, and no file bes
 a .gltf lists in its own folder. Whatever a file announces is compared with what it holds before room is made for it: a
 file below 10 MB takes less than 1 GB and 20 seconds, or is refused. OBJ, OFF, PLY, STL and 3MF are read here, DAE
 through pycollada; glTF is `gltf`, VTK is `vtk`, polygons become triangles in `polygons`.
-Nothing is merged or checked here: what makes a closed surface of it is `surface`.
+Nothing is checked here, nor merged but the equal corners of an STL: what makes a closed surface of it is `surface`.
 """
 
 import io
