@@ -256,6 +256,38 @@ class Progress:
     error: estimate.TableError | None = None
 
 
+@dataclass
+class _Pace:
+    """How many paths a round should have: about ROUND_S of work, and no more than there is time for.
+
+    Parameters
+    ----------
+    deadline : float
+        When to stop, on the monotonic clock [s].
+    length : int
+        Paths of a round.
+    rate : float
+        Paths in a second; 0 as long as it is not known [1/s].
+    """
+
+    deadline: float
+    length: int = CHUNK_MIN
+    rate: float = 0.0
+
+    def next(self, under_way: int) -> int:
+        """Return the paths of the next round if so many are under way; 0 if there is no time for more."""
+        if not self.rate or math.isinf(self.deadline):
+            return self.length
+        left = int((self.deadline - time.monotonic()) * self.rate) - under_way
+        return min(self.length, left) if left >= PIECE else 0
+
+    def learn(self, paths: int, seconds: float) -> None:
+        """Take note of how long a round took."""
+        self.rate = paths / max(seconds, 1e-6)
+        if paths == self.length and seconds < 0.5 * ROUND_S:
+            self.length *= 2
+
+
 @dataclass(eq=False)
 class Build:
     """A table in the making: what was asked for, the paths done and their counts.
@@ -281,6 +313,7 @@ class Build:
     tally: Tally
     done: Spans = field(default_factory=list)
     judgement: int = CHUNK_MIN
+    _latest: tuple[int, estimate.TableError] | None = None
 
     @classmethod
     def start(cls, grain: Grain, optics: Optics, effort: Effort) -> "Build":
@@ -325,10 +358,10 @@ class Build:
                 differing.append(f"--{kind} {getattr(self.effort, kind)}")
         if differing:
             raise TSDFError(
-                f"{name} holds {stored.paths} paths of another build (they differ in {', '.join(differing)}): its own "
-                f"grain, optics, --seed and --max-bounces with any --paths, --cells or --target-error, --joint up to "
-                f"{stored.tally.joint} and --memory up to {stored.tally.memory} can go on with it; to start anew, "
-                f"delete it or choose another --out"
+                f"{name} holds {stored.paths} paths of another build (they differ in {', '.join(differing)}): it "
+                "serves its own grain, optics, --seed and --max-bounces, with any --paths, --cells or --target-error, "
+                f"--joint up to {stored.tally.joint} and --memory up to {stored.tally.memory}; to start anew, delete "
+                "it or choose another --out"
             )
         self.tally, self.done = stored.tally, stored.done
         same = (self.effort.target_error, self.effort.cells) == (stored.effort.target_error, stored.effort.cells)
@@ -338,11 +371,10 @@ class Build:
         """Return the error of the table that would be made now, with the cells it would have."""
         if not self.tally.scalars[:, T.SCATTERED].any():
             return None
-        if self.effort.cells is not None:
-            return estimate.table_error(self.tally, self.effort.cells)
-        assert self.effort.target_error is not None
-        errors = estimate.TableErrors(self.tally)
-        return errors.fewest(self.effort.target_error) or errors.best()
+        if self._latest is None or self._latest[0] != self.paths:
+            errors, target = estimate.TableErrors(self.tally, self.effort.cells), self.effort.target_error
+            self._latest = self.paths, (errors.fewest(target) if target is not None else None) or errors.best()
+        return self._latest[1]
 
     def _judge(self, progress: Progress) -> bool:
         """Tell whether the target is met, and if not, choose when to ask again: never so late that much is wasted.
@@ -401,7 +433,7 @@ class Build:
         part : (int, int)
             Only chunks i, i + n, ... of n parts, counting from 1.
         report : callable
-            Called after each round.
+            Called ten times a second, and at the end.
         reflectance_scale : float
             Makes a wrong tracer, to test the tests, see `tracer.Tracer`.
         max_seconds : float
@@ -465,20 +497,20 @@ class Build:
             if part_file is not None:
                 self.save(part_file)
             return
-        effort, saved, length, pace = self.effort, -math.inf, CHUNK_MIN, 0.0
-        crew = Crew(grain, self.optics, effort.seed, effort.max_bounces, self.tally.joint, self.tally.memory, threads,
+        effort, tally = self.effort, self.tally
+        crew = Crew(grain, self.optics, effort.seed, effort.max_bounces, tally.joint, tally.memory, threads,
                     reflectance_scale)  # fmt: skip
+        under_way: deque[Round] = deque()
+        pace, ahead, before, saved = _Pace(deadline), self.done, time.monotonic(), -math.inf
         with crew:
-            under_way: deque[Round] = deque()
-            ahead, before = self.done, time.monotonic()
             while True:
                 while len(under_way) < 2 and not leave.is_set():
                     wanted = self._wanted(part)
-                    if target is not None and wanted == ahead:  # while the target is judged
+                    if target is not None and wanted == ahead:  # go on while the target is judged
                         wanted = [(0, next(last for _, last in chunks(None) if last > self.judgement))]
-                    left = (deadline - time.monotonic()) * pace - sum(size(one.pieces.values()) for one in under_way)
-                    most = int(min(length, left)) if pace and math.isfinite(left) else length
-                    if not (spans := beginning(without(wanted, ahead), most)) or (most < length and most < PIECE):
+                    running = sum(size(one.pieces.values()) for one in under_way)
+                    spans = beginning(without(wanted, ahead), pace.next(running))
+                    if not spans:
                         break
                     under_way.append(crew.start(spans))
                     ahead = joined([*ahead, *spans])
@@ -487,16 +519,15 @@ class Build:
                 under_way[0].wait(leave)
                 finished = crew.dismiss(under_way, ROUND_S) if leave.is_set() else [under_way.popleft()]
                 for one in finished:
-                    spans, rays = crew.gather(one, self.tally)
+                    spans, rays = crew.gather(one, tally)
                     self.done = joined([*self.done, *spans])
                     progress.rays += rays
                 progress.paths, now = self.paths, time.monotonic()
                 if leave.is_set():
                     break
-                pace = size(spans) / max(now - before, 1e-6)
-                length = 2 * length if now - before < 0.5 * ROUND_S and size(spans) == length else length
+                pace.learn(size(spans), now - before)
                 before = now
-                if target is not None and self.paths >= self.judgement and without(self._wanted(part), self.done) == []:
+                if target is not None and self.done == self._wanted(part):
                     if self._judge_and_save(progress, part_file):
                         break
                 elif tell and target is None:
@@ -505,7 +536,7 @@ class Build:
                 if part_file is not None and now - saved > SAVE_S:
                     self.save(part_file)
                     saved = time.monotonic()
-        if part_file is not None:
+        if part_file is not None and (self.done or not leave.is_set()):
             self.save(part_file)
 
     def _judge_and_save(self, progress: Progress, part_file: Path | None) -> bool:
