@@ -113,7 +113,7 @@ def bead_pile() -> tuple[Array, Array]:
 def directions(height: int) -> tuple[Array, Array, Array]:
     """Return x, y, z of the middles of the pixels of an image of 2 height columns."""
     polar = np.pi * (np.arange(height)[:, None] + 0.5) / height
-    azimuth = np.pi - np.pi * (np.arange(2 * height) + 0.5) / height
+    azimuth = -np.pi * (np.arange(2 * height) + 0.5) / height
     return np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar) * np.ones(2 * height)
 
 

@@ -9,7 +9,7 @@ from tsdf.scene import Camera, EnvironmentLight, Scene, Sphere, SurfaceSpec
 RED, GREEN, BLUE = np.eye(3)
 
 
-def looking(folder, pixels, target=(1.0, 0.0, 0.0), rotation_deg=0.0):
+def looking(folder, pixels, target=(-1.0, 0.0, 0.0), rotation_deg=0.0):
     """Return the world of a camera inside an environment, with a speck of a surface in its view."""
     image.write_exr(folder / "sky.exr", pixels)
     camera = Camera((0.0, 0.0, 0.0), target, 40, 20, fov_deg=90.0)
@@ -21,12 +21,12 @@ def looking(folder, pixels, target=(1.0, 0.0, 0.0), rotation_deg=0.0):
 @pytest.mark.parametrize(
     ("target", "rotation_deg", "left", "right"),
     [
-        ((1.0, 0.0, 0.0), 0.0, RED, BLUE),  # the middle of the image
-        ((0.0, 1.0, 0.0), 90.0, RED, BLUE),  # turned counter-clockwise seen from above, to +y
-        ((-1.0, 0.0, 0.0), 0.0, GREEN, GREEN),  # its edges
-        ((-1.0, 0.0, 0.0), -180.0, RED, BLUE),
-        ((0.0, 1.0, 0.0), 0.0, GREEN, RED),
-        ((0.0, -1.0, 0.0), 0.0, BLUE, GREEN),
+        ((-1.0, 0.0, 0.0), 0.0, RED, BLUE),  # the middle of the image
+        ((0.0, -1.0, 0.0), 90.0, RED, BLUE),  # turned counter-clockwise seen from above, to -y
+        ((1.0, 0.0, 0.0), 0.0, GREEN, GREEN),  # its edges
+        ((1.0, 0.0, 0.0), -180.0, RED, BLUE),
+        ((0.0, -1.0, 0.0), 0.0, GREEN, RED),
+        ((0.0, 1.0, 0.0), 0.0, BLUE, GREEN),
     ],
 )
 def test_left_in_the_image_is_left_in_the_picture(tmp_path, target, rotation_deg, left, right):

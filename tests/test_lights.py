@@ -172,7 +172,7 @@ def quadrature(n, constant, environment, rotation_deg, suns, fine=60):
     height, width = environment.shape[:2]
     polar = np.linspace(0.0, math.pi, height * fine + 1)
     mid = 0.5 * (polar[1:] + polar[:-1])
-    azimuth = math.pi - (np.arange(width * fine) + 0.5) / (width * fine) * 2.0 * math.pi + math.radians(rotation_deg)
+    azimuth = -(np.arange(width * fine) + 0.5) / (width * fine) * 2.0 * math.pi + math.radians(rotation_deg)
     x = np.sin(mid)[:, None] * np.cos(azimuth)
     y = np.sin(mid)[:, None] * np.sin(azimuth)
     cosine = np.maximum(n[0] * x + n[1] * y + n[2] * np.cos(mid)[:, None], 0.0)
@@ -258,7 +258,7 @@ def latlong(x, y, z, width, height):
 
 
 def test_columns_are_those_of_openexr():
-    """Each direction finds the pixel that the definition of OpenEXR gives, whose z, x, y are our x, y, z.
+    """Each direction finds the pixel that the definition of OpenEXR gives, whose -z, -x, y are our x, y, z.
 
     Pixels there are constant, so that those within 1e-6 of an edge are left out. Negative control: columns that run the
     other way, as a mirror image has them.
@@ -269,7 +269,7 @@ def test_columns_are_those_of_openexr():
     ways = np.random.default_rng(8).normal(size=(2000, 3))
     wrong = mirrored = 0
     for x, y, z in ways / np.linalg.norm(ways, axis=1, keepdims=True):
-        column, row = latlong(y, z, x, width, height)
+        column, row = latlong(-y, z, -x, width, height)
         if min(column % 1.0, -column % 1.0, row % 1.0, -row % 1.0) > 1e-6:
             found = radiance(lights, (x, y, z), -1.0)
             wrong += found != tuple(pixels[int(row), int(column)])
@@ -280,13 +280,13 @@ def test_columns_are_those_of_openexr():
 
 @pytest.mark.parametrize("rotation_deg", [0.0, 30.0, -30.0, 300.0, 765.0])
 def test_where_a_pixel_is(rotation_deg):
-    """One bright pixel, row 1 of 4 and column 1 of 8: polar angle 45 to 90, azimuth 90 to 135 degrees from +x to +y.
+    """One bright pixel, row 1 of 4 and column 5 of 8: polar angle 45 to 90, azimuth 90 to 135 degrees from +x to +y.
 
     A rotation adds to the azimuth. Looked at from inside and outside of each edge, and every draw lies in it; mirror
     images are dark.
     """
     pixels = np.zeros((4, 8, 3))
-    pixels[1, 1] = 1e6, 2e6, 3e6
+    pixels[1, 5] = 1e6, 2e6, 3e6
     lights = compile_lights(environment=pixels, rotation_deg=rotation_deg)
 
     def bright(polar_deg, azimuth_deg):

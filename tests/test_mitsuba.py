@@ -490,7 +490,7 @@ def test_environments_are_those_of_mitsuba(target, rotation_deg, tmp_path):
     blocks = np.random.default_rng(4).random((4, 8, 3))
     pixels = np.repeat(np.repeat(blocks, 32, axis=0), 32, axis=1)
     look = mi.ScalarTransform4f().look_at([0, 0, 0], list(target), [0, 0, 1])
-    upright = mi.ScalarTransform4f([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    upright = mi.ScalarTransform4f([[0, 0, -1, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     turned = mi.ScalarTransform4f().rotate([0, 0, 1], rotation_deg)
     film = {"type": "hdrfilm", "width": 24, "height": 16, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     agree = {}

@@ -2,9 +2,9 @@
 
 z is up. A `direction` is a unit triple that points toward the light, the way a camera ray travels on leaving the
 scene; its azimuth runs counter-clockwise seen from above, from +x over +y. Row 0 of an environment is the zenith (+z),
-its last row the nadir. Columns are longitudes as in OpenEXR's ImfEnvmap.h, whose z, x, y are our x, y, z: azimuth falls
-from 180 degrees at the left edge to -180 at the right, so that the middle looks along +x with +y to its left (Blender's
-and three.js's place, too). `rotation_deg` adds to the azimuth. Pixels are constant.
+its last row the nadir. Columns run as in OpenEXR's ImfEnvmap.h, so that left in the image is left in the picture: the
+azimuth falls from 0 at the left edge to -360 degrees at the right, and the middle looks along -x with -y to its left
+(OpenEXR's -z, -x, y are our x, y, z). `rotation_deg` adds to the azimuth. Pixels are constant.
 
 Suns are drawn in proportion to the luminance they send, the environment to that above a multiple of its mean; the
 density is the sum of both over their power, whatever overlaps. The constant is never drawn. Reading image files is
@@ -65,7 +65,7 @@ def compile_lights(
         Radiance of the pixels, >= 0; it adds to the constant.
     rotation_deg : float
         By how much the environment is turned about +z, counter-clockwise seen from above [degrees]: the azimuth of
-        the middle of its width.
+        its left edge.
     suns : sequence of (direction, angular_diameter_deg, irradiance)
         Discs of uniform radiance: a vector toward the centre, of any length; the diameter [degrees], in [1e-6, 180];
         the linear-sRGB irradiance on a surface that faces it, >= 0.
@@ -107,7 +107,7 @@ def compile_lights(
     return LightArrays(
         constant=(float(everywhere[0]), float(everywhere[1]), float(everywhere[2])),
         environment=pixels,
-        rotation=0.5 + math.fmod(rotation_deg, 360.0) / 360.0,
+        rotation=math.fmod(rotation_deg, 360.0) / 360.0,
         cos_edges=cos_edges,
         aim=aim,
         rows=rows,
