@@ -28,6 +28,7 @@ LAYERS = [
         "surface",
         "sampling",
         "vectors",
+        "handle",
         "horizon",
         "image",
         "lights",

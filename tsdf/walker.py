@@ -40,7 +40,8 @@ FLY, JUMP, GRAIN = 0, 1, 2
 UNKNOWN = -2  # medium of a walker that may have crossed a boundary
 
 EVENTS, RAYS, TRUNCATED, FAULTS = range(4)  # counters
-LIVE, ASKED, GRAINS_ASKED = range(3)  # what `advance` returns: walkers, rays to trace, then rays by exemplar
+LIVE, MOST, ASKED, GRAINS_ASKED = range(4)  # of `Batch.asked`
+CLEAR, LOOK, WAIT, ENDED = range(4)  # what becomes of a walker: it has met nothing yet, must look where it goes, ...
 
 OTHER = np.uint64(0xA5A5A5A5A5A5A5A5)
 LOW = np.uint64(0xFFFFFFFF)
@@ -86,6 +87,46 @@ class Absorption(NamedTuple):
     least: np.ndarray
 
 
+class Batch(NamedTuple):
+    """The walkers that one thread takes on together, and what they ask the ray engine.
+
+    walkers (n,) and amounts (n, a) are those under way, out and out_amounts receive those that go on and the shadows
+    that are born; starts and ways (n, 3) float32 the rays in the scene, grain_starts and grain_ways (e, n, 3) those in
+    the exemplars, hits (engines, n) and grain_hits (e, n) int32 the facets that they meet. radiance (samples, 3);
+    counters (4,): see EVENTS; asked (3 + e,): walkers in out, the number of them from which on no more are made, rays
+    asked for in the scene, and in each exemplar.
+    """
+
+    walkers: np.ndarray
+    amounts: np.ndarray
+    out: np.ndarray
+    out_amounts: np.ndarray
+    hits: np.ndarray
+    grain_hits: np.ndarray
+    starts: np.ndarray
+    ways: np.ndarray
+    grain_starts: np.ndarray
+    grain_ways: np.ndarray
+    radiance: np.ndarray
+    counters: np.ndarray
+    asked: np.ndarray
+
+
+@njit(**KERNEL)
+def full(batch):
+    """Return whether a batch has no room for more walkers."""
+    return batch.asked[LIVE] >= batch.asked[MOST]
+
+
+@njit(**KERNEL)
+def born(batch, amounts):
+    """Return the number in `out` of a new walker, whose amounts are those given."""
+    live = batch.asked[LIVE]
+    batch.asked[LIVE] += 1
+    copy(batch.out_amounts[live], amounts)
+    return live
+
+
 @njit(**KERNEL)
 def absorbed(absorption, amounts):
     """Return the colour that the amounts of matter crossed leave of white light."""
@@ -111,12 +152,11 @@ def absorbed(absorption, amounts):
 
 
 @njit(**KERNEL)
-def find(w, r, g, b, amounts, absorption, radiance):
+def find(world, batch, w, amounts, light):
     """Add light found by a walker to its sample."""
-    ar, ag, ab = absorbed(absorption, amounts)
-    radiance[w.sample, 0] += w.weight * w.colour[0] * r * ar
-    radiance[w.sample, 1] += w.weight * w.colour[1] * g * ag
-    radiance[w.sample, 2] += w.weight * w.colour[2] * b * ab
+    left = absorbed(world.absorption, amounts)
+    for k in range(3):
+        batch.radiance[w.sample, k] += w.weight * w.colour[k] * light[k] * left[k]
 
 
 @njit(forceinline=True, **KERNEL)
