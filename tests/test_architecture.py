@@ -29,6 +29,7 @@ LAYERS = [
         "sampling",
         "vectors",
         "handle",
+        "grid",
         "horizon",
         "image",
         "lights",

@@ -131,7 +131,7 @@ def scenes(folder: Path) -> dict[str, Scene]:
 def picture(scene: Scene, level: str) -> np.ndarray:
     """Return the (HEIGHT, WIDTH, 3) float64 picture of a scene at a level; coarse grids are made in no time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(geometry, "FIELD_CELLS", CELLS)
+        patch.setattr(geometry, "GRID_CELLS", CELLS)
         patch.setattr(room, "CELLS", CELLS)
         made = render.render(world.build(scene, level), spp=SPP, seed=SEED, threads=1)
     assert made.truncated == 0

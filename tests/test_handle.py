@@ -7,7 +7,6 @@ import pytest
 from numba import njit
 
 from tsdf.handle import Handle
-from tsdf.vectors import KERNEL
 
 
 class Inner(NamedTuple):
@@ -34,7 +33,7 @@ def outer(several: int = 2, shift: float = 0.0) -> Outer:
     return Outer(True, -7, Inner(np.arange(4.0), np.float64(2.5)), inners, (1.0, 2.0, 3.0), grid, np.zeros(2, ROW))
 
 
-@njit(**KERNEL)
+@njit
 def read(outer, m, i, found):
     """Write what an Outer holds, whether it comes as a handle or as it is, to (9,) found; mark row 1."""
     found[0], found[1], found[2] = 1.0 if outer.flag else 0.0, outer.count, outer.inner.values[i] * outer.inner.scale

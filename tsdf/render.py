@@ -99,7 +99,7 @@ class Walkers:
         engines, exemplars = len(self.place.engines), len(self.packed.engines)
         self.walkers = [np.zeros(ROOM, W.WALKER) for _ in range(2)]
         self.amounts = [np.zeros((ROOM, world.amounts)) for _ in range(2)]
-        self.hits = np.full((engines, ROOM), -1, np.int32)
+        self.hits = np.full((ROOM + 1, engines), -1, np.int32)
         self.grain_hits = np.full((exemplars, ROOM), -1, np.int32)
         self.starts, self.ways = (np.zeros((ROOM, 3), np.float32) for _ in range(2))
         self.grain_starts, self.grain_ways = (np.zeros((exemplars, ROOM, 3), np.float32) for _ in range(2))
@@ -147,7 +147,7 @@ class Walkers:
         T.advance(self.arrays, self.batches[0], live)
         live, rays = int(self.asked[W.LIVE]), int(self.asked[W.ASKED])
         if rays:
-            self.place.hits(self.starts[:rays], self.ways[:rays], self.hits)
+            self.place.hits(self.starts[:rays], self.ways[:rays], self.hits.T)
         for e, asked in enumerate(self.asked[W.GRAINS_ASKED :]):
             if asked:
                 starts, ways = self.grain_starts[e, :asked], self.grain_ways[e, :asked]

@@ -18,7 +18,8 @@ from numba import njit
 
 from tsdf import explicit as X
 from tsdf import memory as M
-from tsdf.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit, facet_hit
+from tsdf.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit
+from tsdf.grid import GRAZING, march, plane_hit
 from tsdf.lights import LightArrays
 from tsdf.lights import draw as draw_light
 from tsdf.lights import radiance as light_from
@@ -48,7 +49,6 @@ from tsdf.walker import (
     FLY,
     GRAIN,
     GRAINS_ASKED,
-    GRAZING,
     JUMP,
     LIVE,
     LOOK,
@@ -77,6 +77,8 @@ from tsdf.walker import (
     renewed,
     write,
 )  # fmt: skip
+
+HAIR = 1e-6  # of a boundary's thickness: an event nearer than this to it may be beyond it by rounding
 
 
 class WorldArrays(NamedTuple):
@@ -357,14 +359,15 @@ def surface_met(g, p, d, hits, ray):
     """Return distance to the next opaque surface, its number, its normal against d, its thickness, and whether the ray
     engine named a facet that is behind p."""
     best, which, n, slack, spurious = math.inf, NONE, (0.0, 0.0, 0.0), 0.0, False
-    if g.solid and hits[0, ray] >= 0:
-        facet = hits[0, ray]
-        t, cosine = facet_hit(g.planes, facet, p, d)
-        slack = g.plane_slack[facet]
+    if g.solid and hits[ray, 0] >= 0:
+        facet = hits[ray, 0]
+        planes = g.grid.planes
+        t, cosine = plane_hit(planes, facet, p, d)
+        slack = g.grid.thickness[facet]
         if t < 0.0:
             spurious = True
         elif t < math.inf:
-            best, which, n = t, g.surface[facet], (g.planes[facet, 0], g.planes[facet, 1], g.planes[facet, 2])
+            best, which, n = t, g.surface[facet], (planes[facet, 0], planes[facet, 1], planes[facet, 2])
             if cosine > 0.0:
                 n = minus(n)
     if g.balls.shape[0] > 0:
@@ -380,18 +383,41 @@ def surface_met(g, p, d, hits, ray):
 
 
 @njit(**KERNEL)
-def boundary_met(g, m, p, d, hits, ray):
+def boundary_met(g, m, p, d, hits, ray, known):
     """Return distance to the next boundary of medium m, whether the ray is inside until then, the outward normal, the
-    boundary's thickness, and whether the ray engine named a facet that is behind p."""
+    boundary's thickness, and whether the ray engine named a facet that is behind p. Where no facet is met, the ray is
+    inside if that is `known`."""
     if g.kind[m] != MESH:
         t, inside, n = exact_hit(g.kind[m], g.shape[m], p, d)
         return t, inside, n, g.slack[m], False
-    facet = hits[g.engine[m], ray]
+    facet = hits[ray, g.engine[m]]
     if facet < 0:
-        return math.inf, False, (0.0, 0.0, 0.0), 0.0, False
-    t, cosine = facet_hit(g.planes, facet, p, d)
-    n = (g.planes[facet, 0], g.planes[facet, 1], g.planes[facet, 2])
-    return t, cosine > 0.0, n, g.plane_slack[facet], t < 0.0
+        return math.inf, known, (0.0, 0.0, 0.0), 0.0, False
+    planes = g.grid.planes
+    t, cosine = plane_hit(planes, facet, p, d)
+    n = (planes[facet, 0], planes[facet, 1], planes[facet, 2])
+    return t, cosine > 0.0, n, g.grid.thickness[facet], t < 0.0
+
+
+@njit(**KERNEL)
+def look(world, batch, w):
+    """See what a walker in a known medium meets next without the ray engine, and write it where answers of the ray
+    engine stand; return whether that was done. A flight ends with its free path, a jump with its length."""
+    g, model = world.geometry, world.media.model
+    end, way = math.inf, triple(w.d)
+    if w.mode == JUMP:
+        end, way = w.length, triple(w.e)
+    elif model == EXPLICIT:
+        pass
+    elif w.shadow and model != TELEPORT_MEMORY:  # farther, it will not survive its roulette; see `pass_through`
+        end = world.media.free[w.medium] * math.log(w.weight / (FAINT * unit(mix(w.key + GOLDEN)) + 1e-300))
+    elif w.free >= 0.0:
+        end = w.free
+    spot = batch.hits.shape[0] - 1
+    if not march(g.grid, batch.hits[spot], triple(w.p), way, max(end, 0.0)):
+        return False
+    w.ray = spot
+    return True
 
 
 @njit(**KERNEL)
@@ -462,7 +488,8 @@ def land(world, batch, w, amounts):
     t, surface, n, slack, spurious = surface_met(g, p, e, hits, w.ray)
     if spurious:
         return again(batch, w, slack)
-    t_b, inside, n_b, slack_b, spurious = boundary_met(g, m, p, e, hits, w.ray)
+    known = w.ray == hits.shape[0] - 1
+    t_b, inside, n_b, slack_b, spurious = boundary_met(g, m, p, e, hits, w.ray, known)
     if spurious:
         return again(batch, w, slack_b)
     w.skip, w.tries = 0.0, 0
@@ -480,7 +507,7 @@ def land(world, batch, w, amounts):
     move = min(beyond(slack_b, dot(n_b, e)), 0.5 * (t - t_b)) if inside else 0.0
     if leaves:
         for k in range(g.kind.shape[0]):
-            t_k, inside, n_k, slack_k, spurious = boundary_met(g, k, p, e, hits, w.ray)
+            t_k, inside, n_k, slack_k, spurious = boundary_met(g, k, p, e, hits, w.ray, False)
             if k != m and not inside and not spurious and abs(t_k - t_b) * abs(dot(n_k, e)) <= slack_b + slack_k:
                 # Another medium begins where this one ends: the grain lies in both
                 gone = min(t_b + move, w.length)
@@ -512,7 +539,8 @@ def fly(world, batch, w, amounts):
         return again(batch, w, slack)
     home, t_b, n_b, slack_b = NONE, math.inf, n, 0.0
     for m in range(g.kind.shape[0]):
-        t_m, inside, n_m, slack_m, spurious = boundary_met(g, m, p, d, hits, w.ray)
+        known = m == w.medium and w.ray == hits.shape[0] - 1
+        t_m, inside, n_m, slack_m, spurious = boundary_met(g, m, p, d, hits, w.ray, known)
         if spurious:
             return again(batch, w, slack_m)
         if home == NONE and (inside or t_m < t_b):
@@ -524,7 +552,7 @@ def fly(world, batch, w, amounts):
     w.skip, w.tries, w.medium = 0.0, 0, home
     facing = abs(dot(n, d)) if t < math.inf else 1.0
     if home != NONE:
-        state = pass_through(world, batch, w, amounts, t_b, t, slack / facing)
+        state = pass_through(world, batch, w, amounts, t_b - HAIR * beyond(slack_b, dot(n_b, d)), t, slack / facing)
         if state != CLEAR:
             return state
     w.free = -1.0
@@ -711,14 +739,25 @@ def follow(world, batch, w, amounts):
             if state != CLEAR:
                 return state
         turns += 1
-        if (engines and w.ray < 0) or (full(batch) and not w.shadow) or turns > PATIENCE:
-            if engines:
-                ask(batch, w)
+        if (full(batch) and not w.shadow) or turns > PATIENCE:
+            w.ray = NONE  # by the next turn its answer is another's
+            return WAIT
+        if engines and w.ray < 0 and (w.medium < 0 or not look(world, batch, w)):
+            ask(batch, w)
             return WAIT
         state = land(world, batch, w, amounts) if w.mode == JUMP else fly(world, batch, w, amounts)
         w.ray = NONE
         if state == ENDED:
             return ENDED
+
+
+@njit(**KERNEL)
+def keep(batch, w, amounts):
+    """Have a walker go on in the next turn."""
+    live = batch.asked[LIVE]
+    batch.out[live] = w
+    copy(batch.out_amounts[live], amounts)
+    batch.asked[LIVE] += 1
 
 
 @njit(**KERNEL)
@@ -735,19 +774,17 @@ def advance(world, batch, count):
     for i in range(count):
         w, amounts = batch.walkers[i], batch.amounts[i]
         asked[MOST] = batch.out.shape[0] - (count - i) - 2
-        if follow(world, batch, w, amounts) == ENDED:
+        first = asked[LIVE]
+        state = follow(world, batch, w, amounts)
+        # The shadows that were born on the way
+        last, asked[LIVE] = asked[LIVE], first
+        for k in range(first, last):
+            if follow(world, batch, batch.out[k], batch.out_amounts[k]) != ENDED:
+                keep(batch, batch.out[k], batch.out_amounts[k])
+        if state == ENDED:
             w.sample = ~w.sample
         else:
-            live = asked[LIVE]
-            batch.out[live] = w
-            copy(batch.out_amounts[live], amounts)
-            asked[LIVE] += 1
-    # Shadows that were born on the way have not looked yet
-    if world.geometry.engines > 0:
-        for i in range(asked[LIVE]):
-            w = batch.out[i]
-            if w.ray < 0 and w.mode != GRAIN:
-                ask(batch, w)
+            keep(batch, w, amounts)
     batch.counters[RAYS] += asked[ASKED]
 
 

@@ -51,7 +51,6 @@ MAX_EVENTS = 50_000_000  # of one path; only light that nothing lets out comes t
 DIM = math.log(0.25)  # walkers dimmer than this may end
 FAINT = 0.02  # shadows fainter than this may end
 TRIES = 8  # to start a ray off a facet, each twice as far from it
-GRAZING = 100.0  # times its thickness is the most that a point is moved off a facet along a ray
 
 
 class Media(NamedTuple):
@@ -92,7 +91,8 @@ class Batch(NamedTuple):
 
     walkers (n,) and amounts (n, a) are those under way, out and out_amounts receive those that go on and the shadows
     that are born; starts and ways (n, 3) float32 the rays in the scene, grain_starts and grain_ways (e, n, 3) those in
-    the exemplars, hits (engines, n) and grain_hits (e, n) int32 the facets that they meet. radiance (samples, 3);
+    the exemplars, hits (n + 1, engines) and grain_hits (e, n) int32 the facets that they meet, the last of
+    hits those of the walker under way. radiance (samples, 3);
     counters (4,): see EVENTS; asked (3 + e,): walkers in out, the number of them from which on no more are made, rays
     asked for in the scene, and in each exemplar.
     """
