@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tsdf import levels
 from tsdf.cli.common import Tool, plain
 
 if TYPE_CHECKING:
     from tsdf.render import Picture
     from tsdf.world import World
 
-LEVELS = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume", "volume-hg", "isotropic")
+LEVELS = tuple(levels.LEVELS)
 
 
 @click.command("tsdf-render", cls=Tool)

@@ -15,7 +15,7 @@ ROOT = PACKAGE.parent
 
 # What each module may import of the package: only what stands below it.
 LAYERS = [
-    {"errors"},
+    {"errors", "levels"},
     {
         "files",
         "container",

@@ -19,6 +19,7 @@ import pytest
 
 from tsdf import format, geometry, image, render, room, scatterometer, world
 from tsdf.grains import load_grain
+from tsdf.levels import LEVELS
 from tsdf.optics import Optics
 from tsdf.scatterometer import Build, Effort
 from tsdf.scene import (
@@ -38,7 +39,6 @@ from tsdf.scene import (
     SurfaceSpec,
 )
 from tsdf.table import Table
-from tsdf.walker import MODELS
 
 GOLDEN = Path(__file__).parent / "golden"
 WIDTH, HEIGHT, SPP, SEED = 16, 12, 4, 1
@@ -149,7 +149,7 @@ def kept() -> dict[str, np.ndarray]:
         return dict(file)
 
 
-@pytest.mark.parametrize("level", MODELS)
+@pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("kind", ["box", "ball", "slab", "mesh", "centres", "spectral", "within"])
 def test_pictures_stay(kinds: dict[str, Scene], kept: dict[str, np.ndarray], kind: str, level: str) -> None:
     found, before = picture(kinds[kind], level), kept[f"{kind} {level}"]
@@ -158,7 +158,7 @@ def test_pictures_stay(kinds: dict[str, Scene], kept: dict[str, np.ndarray], kin
 
 
 def test_every_picture_is_looked_at(kinds: dict[str, Scene], kept: dict[str, np.ndarray]) -> None:
-    assert set(kept) == {f"{kind} {level}" for kind in kinds for level in MODELS}
+    assert set(kept) == {f"{kind} {level}" for kind in kinds for level in LEVELS}
 
 
 def main() -> None:
@@ -170,7 +170,7 @@ def main() -> None:
         found = {
             f"{kind} {level}": picture(scene, level)
             for kind, scene in scenes(Path(folder)).items()
-            for level in MODELS
+            for level in LEVELS
         }  # fmt: skip
     same = [name for name, rgb in found.items() if name in before and np.array_equal(rgb, before[name])]
     print(f"{len(same)} of {len(found)} pictures are the same to the last bit")

@@ -10,6 +10,7 @@ import pytest
 
 from tsdf import geometry, image, lights, render, scatterometer, world
 from tsdf.grains import load_grain
+from tsdf.levels import LEVELS
 from tsdf.optics import Optics
 from tsdf.render import Picture
 from tsdf.scatterometer import Effort
@@ -27,12 +28,10 @@ from tsdf.scene import (
     Sphere,
     SurfaceSpec,
 )
-from tsdf.walker import MODELS
 
 ONE = (ConstantLight((1.0, 1.0, 1.0)),)
 OUTSIDE = Camera((3.0, -30.0, 7.0), (0.0, 0.0, 0.0), 16, 12, fov_deg=30.0)
 INSIDE = Camera((0.3, -0.2, 0.1), (1.0, 0.5, 0.3), 8, 6, fov_deg=100.0)
-LEVELS = tuple(MODELS)
 JUMPING = ("teleport", "teleport-joint", "teleport-memory", "volume", "explicit")  # one of each way to move
 MOST = {"explicit": 0.6, "teleport-memory": 0.64}  # packing fractions of quick packings, of tabulated ones
 BOX = Box((-6.0, -5.0, -4.0), (6.0, 5.0, 4.0))

@@ -43,7 +43,6 @@ from tsdf.walker import (
     DIM,
     ENDED,
     EVENTS,
-    EXPLICIT,
     FAINT,
     FAULTS,
     FLY,
@@ -56,14 +55,9 @@ from tsdf.walker import (
     OTHER,
     PATIENCE,
     RAYS,
-    TELEPORT,
-    TELEPORT_JOINT,
-    TELEPORT_MEMORY,
     TRIES,
     TRUNCATED,
     UNKNOWN,
-    VOLUME,
-    VOLUME_HG,
     WAIT,
     Absorption,
     Media,
@@ -146,7 +140,7 @@ def bent(d, cosine, u):
 def offset_of(media, tables, c, column, key):
     """Draw r, z, phi_Delta and the path length [R] given the deflection, from the word of `key` and the next."""
     bits = mix(key)
-    if media.model == TELEPORT_JOINT:
+    if media.traits.joint:
         return draw_record(tables, column, unit(bits))
     u2, u3 = halves(bits)
     u4, u5 = halves(mix(key + GOLDEN))
@@ -174,10 +168,10 @@ def connect(world, batch, w, amounts, p, c, share, bound):
         return
     cosine = dot(d, toward)
     column = 0
-    if media.model <= VOLUME:
+    if media.traits.tabulated:
         column = column_of(tables, c, min(max(cosine, -1.0), 1.0))
         phase = density(tables, column)
-    elif media.model == VOLUME_HG:
+    elif media.traits.lobe:
         phase = lobe_density(media.g[c], cosine)
     else:
         phase = 0.25 / math.pi
@@ -187,7 +181,7 @@ def connect(world, batch, w, amounts, p, c, share, bound):
     shadow, its_amounts = batch.out[number], batch.out_amounts[number]
     amount, offset = 1.0, (0.0, 0.0, 0.0)
     key += GOLDEN
-    if media.model <= TELEPORT_JOINT:
+    if media.traits.jumps:
         r, z, phi, length = offset_of(media, tables, c, column, key)
         key += GOLDEN
         side = step(toward, -cosine, d)
@@ -201,7 +195,7 @@ def connect(world, batch, w, amounts, p, c, share, bound):
         amount = scale * length
         along, aside, up = z * scale, r * co * scale, r * si * scale
         offset = step(step((along * d[0], along * d[1], along * d[2]), aside, side), up, cross(d, side))
-    elif media.model == VOLUME:
+    elif media.traits.tabulated:
         amount = media.scale[c] * draw_length(tables, column, unit(mix(key))) if media.slot[c] >= 0 else 0.0
     if media.slot[c] >= 0:
         its_amounts[media.slot[c]] += amount
@@ -231,18 +225,18 @@ def deflection(world, c, u0, key):
     """Return the cosine of the deflection by a grain of component c that u0 stands for, its density per steradian, -1
     for an atom, r, z, phi_Delta and path length [R], 1 where there are none, and the key that is used up."""
     media, tables = world.media, world.tables
-    model, slot = media.model, media.slot[c]
+    traits, slot = media.traits, media.slot[c]
     r, z, phi, length = 0.0, 0.0, 0.0, 1.0
-    if model <= VOLUME:
+    if traits.tabulated:
         column, cosine = draw_column(tables, c, u0)
         pdf = density(tables, column)
         if pdf <= 0.0:
             pdf = -1.0
         key += GOLDEN
         bits = mix(key)
-        if model == TELEPORT_JOINT:
+        if traits.joint:
             r, z, phi, length = draw_record(tables, column, unit(bits))
-        elif model == TELEPORT:
+        elif traits.jumps:
             u2, u3 = halves(bits)
             key += GOLDEN
             u4, u5 = halves(mix(key))
@@ -251,7 +245,7 @@ def deflection(world, c, u0, key):
                 length = draw_length(tables, column, u5)
         elif slot >= 0:
             length = draw_length(tables, column, unit(bits))
-    elif model == VOLUME_HG:
+    elif traits.lobe:
         cosine = lobe(media.g[c], u0)
         pdf = lobe_density(media.g[c], cosine)
     else:
@@ -403,13 +397,13 @@ def boundary_met(g, m, p, d, hits, ray, known):
 def look(world, batch, w):
     """See what a walker in a known medium meets next without the ray engine, and write it where answers of the ray
     engine stand; return whether that was done. A flight ends with its free path, a jump with its length."""
-    g, model = world.geometry, world.media.model
+    g, traits = world.geometry, world.media.traits
     end, way = math.inf, triple(w.d)
     if w.mode == JUMP:
         end, way = w.length, triple(w.e)
-    elif model == EXPLICIT:
+    elif traits.packed:
         pass
-    elif w.shadow and model != TELEPORT_MEMORY:  # farther, it will not survive its roulette; see `pass_through`
+    elif w.shadow and not traits.remembers:  # farther, it will not survive its roulette; see `pass_through`
         end = world.media.free[w.medium] * math.log(w.weight / (FAINT * unit(mix(w.key + GOLDEN)) + 1e-300))
     elif w.free >= 0.0:
         end = w.free
@@ -580,7 +574,7 @@ def pass_through(world, batch, w, amounts, t_b, t, thick):
     """Take a walker through the medium that it is in, whose boundary is at distance t_b and, if at all, a surface at t,
     that thick along the ray; return CLEAR if it comes through, else what becomes of it."""
     media, m, end = world.media, w.medium, min(t, t_b)
-    if media.model == EXPLICIT:
+    if media.traits.packed:
         if w.shadow:
             return ENDED
         w.pdf = -1.0
@@ -588,7 +582,7 @@ def pass_through(world, batch, w, amounts, t_b, t, thick):
         if s < math.inf and t - s > thick:
             enter(world, w, s, centre, key)
             return LOOK
-    elif media.model == TELEPORT_MEMORY:
+    elif media.traits.remembers:
         if w.free < 0.0:
             M.begin(w, world.memory)
         if w.free < t_b and t - w.free > thick:
@@ -692,7 +686,7 @@ def meet_grain(world, batch, w, amounts):
 def go_deep(world, batch, w, amounts):
     """Take a walker in a known medium as far as it is sure to meet nothing; return CLEAR if it must look, else what
     becomes of it."""
-    if world.media.model == EXPLICIT:
+    if world.media.traits.packed:
         bound = clearance(world.geometry, w.medium, triple(w.p))
         if bound > 0.0:
             s, centre, key = X.next_grain(world.grains, world.room, w.medium, triple(w.p), triple(w.d), bound)
@@ -702,7 +696,7 @@ def go_deep(world, batch, w, amounts):
         return CLEAR
     if w.skip != 0.0:
         return CLEAR
-    if world.media.model == TELEPORT_MEMORY:
+    if world.media.traits.remembers:
         state = M.roam(world, batch, w, amounts, False)
     else:
         state = wander(world, batch, w, amounts, False)
@@ -729,7 +723,7 @@ def follow(world, batch, w, amounts):
             if state != LOOK:
                 return state
             continue
-        if w.mode == FLY and w.ray < 0 and w.medium >= 0 and (not w.shadow or world.media.model == TELEPORT_MEMORY):
+        if w.mode == FLY and w.ray < 0 and w.medium >= 0 and (not w.shadow or world.media.traits.remembers):
             state = go_deep(world, batch, w, amounts)
             if state == LOOK:
                 turns += 1

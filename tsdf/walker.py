@@ -10,19 +10,9 @@ import numpy as np
 from numba import njit
 
 from tsdf.geometry import NONE
+from tsdf.levels import Traits
 from tsdf.sampling import mix, unit
 from tsdf.vectors import KERNEL, dot
-
-TELEPORT, TELEPORT_JOINT, VOLUME, VOLUME_HG, ISOTROPIC, EXPLICIT, TELEPORT_MEMORY = range(7)
-MODELS = {
-    "teleport": TELEPORT,
-    "teleport-joint": TELEPORT_JOINT,
-    "volume": VOLUME,
-    "volume-hg": VOLUME_HG,
-    "isotropic": ISOTROPIC,
-    "explicit": EXPLICIT,
-    "teleport-memory": TELEPORT_MEMORY,
-}
 
 WALKER = np.dtype(
     [("p", "3f8"), ("d", "3f8"), ("q", "3f8"), ("e", "3f8"), ("t", "3f8"), ("colour", "3f8"), ("weight", "f8"),
@@ -56,14 +46,14 @@ TRIES = 8  # to start a ray off a facet, each twice as far from it
 class Media(NamedTuple):
     """What kernels ask about media (m,) and their components (c,).
 
-    model: one of the constants above for all media; free: mean free path; reach: the longest jump; first, kinds: its
+    traits: of the level, for all media; free: mean free path; reach: the longest jump; first, kinds: its
     first component and how many it has; travel: amount that counts the length flown, or -1. Of components: choice, the
     running sum of the probability that the next grain met is of it; scale: what one event's path length [R], or the
     event itself where there is none, counts in the amount `slot`; slot, -1 for none; g: mean cosine of the
     Henyey-Greenstein lobe. Lengths in scene units. limit: events after which a path is given up.
     """
 
-    model: int
+    traits: Traits
     free: np.ndarray
     reach: np.ndarray
     first: np.ndarray
