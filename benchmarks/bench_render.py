@@ -44,7 +44,7 @@ from tsdf.scene import (
     Sphere,
 )
 from tsdf.table import Table
-from tsdf.transport import EVENTS
+from tsdf.transport import EVENTS, Job
 
 FRACTION = 0.6
 LARGE = 500.0  # [R] radius of the ball of grains
@@ -168,7 +168,7 @@ def shot(made: world.World, walkers: Walkers, samples: int, seed: int) -> Shot:
     beam = world.beam(made, (0.0, 0.0, THICK), (0.0, 0.0, -1.0), 100.0)
     before = int(walkers.counters[EVENTS])
     start = time.process_time()
-    radiance = walkers.follow(beam, 0, 1, samples, 0, seed, threading.Event())
+    radiance = walkers.follow(Job(beam, 0, samples, 0, seed), 1, threading.Event())
     taken = time.process_time() - start
     return Shot(radiance[0, :, 0], taken, int(walkers.counters[EVENTS]) - before)
 

@@ -17,11 +17,12 @@ from typing import Any, NoReturn
 
 import click
 
+from tsdf import levels
 from tsdf.cli import start
 from tsdf.cli.start import answer, interrupt_status
 from tsdf.errors import TSDFError, UsageError
 
-LEVELS = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume", "volume-hg", "isotropic")
+LEVELS = tuple(levels.LEVELS)
 MOST_THREADS = 1024
 EVERY_S = 60.0  # [s] between lines of progress where no terminal shows a bar
 LEAST_S = 0.1  # [s] between two looks of a bar

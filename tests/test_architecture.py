@@ -16,7 +16,7 @@ ROOT = PACKAGE.parent
 
 # What each module may import of the package: only what stands below it.
 LAYERS = [
-    {"errors"},
+    {"errors", "levels"},
     {
         "files",
         "compiled",
@@ -32,6 +32,8 @@ LAYERS = [
         "surface",
         "sampling",
         "vectors",
+        "handle",
+        "grid",
         "horizon",
         "image",
         "lights",

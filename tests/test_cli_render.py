@@ -14,7 +14,7 @@ import PIL.Image
 import pytest
 from click.testing import CliRunner, Result
 
-from tsdf import image, scene
+from tsdf import image
 from tsdf.cli import common
 from tsdf.cli.render import main
 from tsdf.reference_data.make_checks import CHECKS
@@ -245,7 +245,3 @@ def test_a_reader_who_is_gone_costs_no_result(monkeypatch: pytest.MonkeyPatch) -
         patch.setattr(common.click, "echo", gone)
         progress(0.5, "word")
         progress.note("note")
-
-
-def test_levels_are_those_of_scenes() -> None:
-    assert common.LEVELS == scene.LEVELS

@@ -11,6 +11,7 @@ from tsdf import geometry, scatterometer
 from tsdf.errors import SceneError
 from tsdf.geometry import clearance, exact_hit
 from tsdf.grains import load_grain
+from tsdf.grid import cells_of
 from tsdf.optics import Optics
 from tsdf.room import BALL, BOX, SLAB, exact_depth, triangle_distance
 from tsdf.scatterometer import Effort
@@ -160,7 +161,7 @@ def test_distances_bound_those_of_each_cell(bumpy, table):
     for step in (0.05, 0.2):
         counts = np.array([int(5.2 / step)] * 3)
         low = np.full(3, -2.6)
-        found = geometry.distances(corners, low, step, counts)
+        found = cells_of(corners, geometry.planes_of(corners), low, step, counts)[0]
         at = np.random.default_rng(4).integers(0, counts, (2000, 3))
         true = np.full(len(at), math.inf)
         exact_distances(corners, low + step * (at + 0.5), true)

@@ -39,6 +39,7 @@ from tsdf.scene import (
     SurfaceSpec,
 )
 from tsdf.table import Table
+from tsdf.walker import WALKER
 from tsdf.world import World
 
 CAMERA = Camera((0.0, 0.0, 10.0), (0.0, 0.0, 0.0), 1, 1, up=(0.0, 1.0, 0.0))
@@ -397,21 +398,20 @@ def test_light_leaves_a_traced_grain_as_its_table_says(cube: Table) -> None:
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     b2 = rng.random((n, 1))
     p = np.sqrt(b2) * side - np.sqrt(1.0 - b2) * d
-    began, facet = d.copy(), np.full(n, -1)
-    state, key = np.zeros(n, np.int64), np.array([keyed(i) for i in range(n)])
-    alive, met, starts = np.arange(n), np.zeros(n, bool), p.copy()
+    walkers = np.zeros(n, WALKER)
+    walkers["p"] = walkers["e"] = p
+    walkers["d"], walkers["facet"], walkers["key"] = d, -1, [keyed(i) for i in range(n)]
+    began, alive, met = d, np.arange(n), np.zeros(n, bool)
     while len(alive):
-        hits = packed.hits(0, starts[alive].astype(np.float32), d[alive].astype(np.float32))
+        starts, ways = (walkers[name][alive].astype(np.float32) for name in ("e", "d"))
+        hits = packed.hits(0, starts, ways)
+        met[alive] |= hits >= 0
         for hit, i in zip(hits, alive, strict=True):
-            start, way, _, facet[i], state[i], key[i], fault = explicit.at_facet(
-                g.planes, g.centroids, hit, facet[i], tuple(p[i]), tuple(d[i]), g.eta[0], state[i], key[i]
-            )
+            w = walkers[i]
+            w["p"], w["d"], _, w["state"], fault = explicit.at_facet(g, w, hit)
             assert not fault
-            met[i] |= hit >= 0
-            d[i], starts[i] = way, start
-            if not state[i] & explicit.RETRIED:
-                p[i] = start
-        alive = alive[(state[alive] & explicit.LEFT) == 0]
+        alive = alive[(walkers["state"][alive] & explicit.LEFT) == 0]
+    d = walkers["d"]
     share = cube.statistics["hit_probability"]
     assert abs(met.mean() - share) < SIGMAS * math.sqrt(share * (1.0 - share) / n)
     cosines = np.einsum("ij,ij->i", d, began)[met]

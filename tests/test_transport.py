@@ -10,6 +10,7 @@ import pytest
 
 from tsdf import geometry, image, lights, render, scatterometer, world
 from tsdf.grains import load_grain
+from tsdf.levels import LEVELS
 from tsdf.optics import Optics
 from tsdf.render import Picture
 from tsdf.scatterometer import Effort
@@ -27,12 +28,10 @@ from tsdf.scene import (
     Sphere,
     SurfaceSpec,
 )
-from tsdf.walker import MODELS
 
 ONE = (ConstantLight((1.0, 1.0, 1.0)),)
 OUTSIDE = Camera((3.0, -30.0, 7.0), (0.0, 0.0, 0.0), 16, 12, fov_deg=30.0)
 INSIDE = Camera((0.3, -0.2, 0.1), (1.0, 0.5, 0.3), 8, 6, fov_deg=100.0)
-LEVELS = tuple(MODELS)
 JUMPING = ("teleport", "teleport-joint", "teleport-memory", "volume", "explicit")  # one of each way to move
 MOST = {"explicit": 0.6, "teleport-memory": 0.64}  # packing fractions of quick packings, of tabulated ones
 BOX = Box((-6.0, -5.0, -4.0), (6.0, 5.0, 4.0))
@@ -94,7 +93,7 @@ def scene_of(shapes, table, *surfaces, fraction=0.5, lights=ONE, camera=OUTSIDE,
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
     """Make the grid of distances in no time: how fine it is must not matter."""
-    monkeypatch.setattr(geometry, "FIELD_CELLS", 50_000)
+    monkeypatch.setattr(geometry, "GRID_CELLS", 50_000)
 
 
 def aimed(made: world.World) -> world.World:
@@ -349,10 +348,12 @@ def test_exact_boundaries_are_the_meshes_limit(level, folder, ball):
 @pytest.mark.parametrize("level", JUMPING[:3])
 def test_deep_steps_change_nothing(level, folder, ball, monkeypatch):
     """Walkers that ask the ray engine at each event, for no distance is known to be free, find the same reflectance."""
-    monkeypatch.setattr(geometry, "FIELD_CELLS", 1_000_000)
+    monkeypatch.setattr(geometry, "GRID_CELLS", 1_000_000)
     made = world.build(scene_of([Mesh(folder / "box.ply")], ball, lights=under(folder, "above")), level)
     expected = reflectance(made, 20_000)
-    place = replace(made.place, arrays=made.place.arrays._replace(field=np.zeros_like(made.place.arrays.field)))
+    g = made.place.arrays.grid
+    blank = g._replace(free=np.zeros((0, 0, 0), np.float32), closed=False, beyond=False)
+    place = replace(made.place, arrays=made.place.arrays._replace(grid=blank))
     blind = reflectance(replace(made, place=place), 20_000, seed=1)
     assert blind.rays > 1.2 * expected.rays
     assert agree(blind, expected)

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from tsdf import format
+from tsdf import levels as L
 from tsdf.errors import TSDFError, UsageError
 from tsdf.experiment import (
     BLOCKS,
@@ -54,7 +55,9 @@ SHOWN = 0.6  # packing fraction that the chart's slabs are nearest to
 BULK, TIMED = 0.25, 0.1  # shares of the time for the bulk and for the time per event
 ROUNDS = 5  # of all levels in turn, for the time per event
 LARGEST_SEED = 2**63
-MOVED = ("volume", "volume-hg", "isotropic")  # levels whose free path depends on absorption
+MOVED = tuple(
+    name for name, level in L.LEVELS.items() if not level.traits.spheres
+)  # levels whose free path depends on absorption
 
 
 # ---------------------------------------------------------------------------------------------- the grid
@@ -243,11 +246,10 @@ def _checked(
 
 def _lacks(level: str, table: Table, notes: list[str]) -> bool:
     """Return whether a table lacks what a level draws from, and note it."""
-    wants = {"teleport-memory": (table.memory, "records by entry", "--memory 64"),
-             "teleport-joint": (table.joint, "joint records", "--joint 32")}  # fmt: skip
-    if level not in wants or wants[level][0]:
+    records = L.LEVELS[level].records
+    if records is None or getattr(table, records.block):
         return False
-    notes.append(f"{level} is skipped: the table has no {wants[level][1]}; build it with {wants[level][2]}")
+    notes.append(f"{level} is skipped: the table has no {records.name}; build it with {records.option}")
     return True
 
 

@@ -94,7 +94,8 @@ def _batch(world: World, camera: T.Camera, first: int, paths: int, seed: int, ma
     """Follow paths to their end, or past their limit of events so often; return as `follow` does."""
     mine = Walkers(world)
     began = time.thread_time()
-    radiance = np.zeros((paths, 3))
+    mine.reserve(paths)
+    job = T.Job(camera, 0, first + paths, 0, seed)
     places = np.zeros((paths, marks, 3))
     start, place, way = (np.zeros((paths, 3)) for _ in range(3))
     weight, amounts = np.zeros(paths), np.zeros((paths, world.amounts))
@@ -104,12 +105,12 @@ def _batch(world: World, camera: T.Camera, first: int, paths: int, seed: int, ma
         if live <= SLOTS // 2 and spawned < paths:
             fresh = min(SLOTS - live, paths - spawned)
             new = mine.walkers[0][live : live + fresh]
-            T.spawn(first + spawned, fresh, 0, first + paths, 0, seed, camera, new, mine.amounts[0][live:])
+            mine.spawn(live, job, first + spawned, fresh)
             new["sample"] -= first
             start[new["sample"]] = new["p"]
             spawned, live = spawned + fresh, live + fresh
         before = live
-        live = mine.turn(live, radiance)
+        live = mine.turn(live)
         gone = np.flatnonzero(mine.walkers[1][:before]["sample"] < 0)
         those = mine.walkers[1][gone].copy()
         number = ~those["sample"]

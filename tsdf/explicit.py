@@ -24,7 +24,8 @@ from tsdf.room import stands
 from tsdf.sampling import GOLDEN, key_of, mix, turn, unit
 from tsdf.scene import GrainSpec, Scene
 from tsdf.table import Table
-from tsdf.vectors import KERNEL, dot, step
+from tsdf.vectors import KERNEL, dot, step, triple
+from tsdf.walker import write
 
 OFFSET = 1e-5  # [R] restart distance off a facet along its normal, as in `tracer`
 RETRY = 1e-3  # share of the way to the facet's centroid by which a failed restart is moved
@@ -140,46 +141,48 @@ def through_sphere(p, d, eta, kept_apart, key):
 
 
 @njit(**KERNEL)
-def at_facet(planes, centroids, facet, last, p, d, eta, state, key):
-    """Take light at p along d in a grain's frame to the facet that the ray engine found, -1 for none, and on.
+def at_facet(grains, w, facet):
+    """Take a walker in a grain's frame to the facet that the ray engine found, -1 for none, and on: its facet, its key
+    and where its next ray starts, off the facet along its normal.
 
     Returns
     -------
-    start, d : triples
-        Where the next ray starts, off the facet along its normal, and the way the light goes on. With RETRIED the same
-        ray is to be repeated from there, and `p` stays what it was.
+    p, d : triples
+        Where it is and the way it goes on, both as they were if the same ray is to be repeated from nearer the middle
+        of the facet it came from.
     length : float
         Travelled inside [R].
-    facet : int
-        The facet it is on.
     state : int
         INSIDE, RETRIED and LEFT (the light left the grain for good) as bits.
-    key : uint64
     fault : bool
         The light was inside and met nothing, twice: it is set free where it is.
     """
-    inside = (state & INSIDE) != 0
+    p, d, eta, last = triple(w.p), triple(w.d), grains.eta[w.component], w.facet
+    write(w.e, p)
+    inside = (w.state & INSIDE) != 0
     if facet < 0 and not inside:
-        return p, d, 0.0, facet, LEFT, key, False
+        w.facet = facet
+        return p, d, 0.0, LEFT, False
     n, cosine, t = (0.0, 0.0, 0.0), 0.0, 0.0
     lost = facet < 0
     if not lost:
-        n = (planes[facet, 0], planes[facet, 1], planes[facet, 2])
+        n = (grains.planes[facet, 0], grains.planes[facet, 1], grains.planes[facet, 2])
         cosine = dot(n, d)
-        t = (planes[facet, 3] - dot(n, p)) / cosine
+        t = (grains.planes[facet, 3] - dot(n, p)) / cosine
     if lost or (cosine > 0.0) != inside or not (-10.0 * OFFSET <= t <= 2.5):
-        if last < 0 or state & RETRIED:
-            return p, d, 0.0, facet, LEFT, key, inside
-        middle = (centroids[last, 0] - p[0], centroids[last, 1] - p[1], centroids[last, 2] - p[2])
-        return step(p, RETRY, middle), d, 0.0, last, state | RETRIED, key, False
+        if last < 0 or w.state & RETRIED:
+            w.facet = facet
+            return p, d, 0.0, LEFT, inside
+        write(w.e, step(p, RETRY, step(triple(grains.centroids[last]), -1.0, p)))
+        return p, d, 0.0, w.state | RETRIED, False
     t = max(t, 0.0)
     p = step(p, t, d)
     length = t if inside else 0.0
     ratio = 1.0 / eta if inside else eta
     cos_i = min(abs(cosine), 1.0)
     reflectance, cos_t = fresnel(cos_i, ratio, UNPOLARISED)
-    key = mix(key + GOLDEN)
-    if unit(key) < reflectance:
+    w.key = mix(w.key + GOLDEN)
+    if unit(w.key) < reflectance:
         d = step(d, -2.0 * cosine, n)
     else:
         bend = cos_t - cos_i / ratio
@@ -187,7 +190,10 @@ def at_facet(planes, centroids, facet, last, p, d, eta, state, key):
         inside = not inside
     half = 1.5 - 0.5 * dot(d, d)
     d = (d[0] * half, d[1] * half, d[2] * half)
-    return step(p, -OFFSET if inside else OFFSET, n), d, length, facet, INSIDE if inside else 0, key, False
+    p = step(p, -OFFSET if inside else OFFSET, n)
+    write(w.e, p)
+    w.facet = facet
+    return p, d, length, INSIDE if inside else 0, False
 
 
 @njit(**KERNEL)

@@ -18,15 +18,14 @@ import numpy as np
 from tsdf.compiled import njit
 from tsdf.errors import GrainError, SceneError
 from tsdf.grains import first_hit, grain_from_mesh, triangle_scene
+from tsdf.grid import Grid, free_around, grid_of
 from tsdf.meshes import read_mesh
 from tsdf.room import BALL, BOX, CLOSED, MESH, OPEN, SLAB, Room, exact_depth, room_of
 from tsdf.scene import FARTHEST, SMALLEST, Box, MediumSpec, Mesh, Rectangle, Scene, Slab, Sphere, SurfaceSpec
 from tsdf.vectors import KERNEL, dot, step
 
 SLACK = 2e-6  # [of a facet's largest coordinate] a point this near to a facet is on it: 30 float32 ulps
-FIELD_CELLS = 2_000_000  # of the grid of distances: half a second to make
-FIELD_FACETS = 1_000_000  # about, the size of a cell, that facets are cut into there: seconds
-BATCH = 100_000  # facets that are cut at a time
+GRID_CELLS = 2_000_000  # of the grid of facets: half a second to make
 RANGE = 1e6  # of the largest coordinate to the smallest extent of a medium, which a facet that large blurs
 DIGITS = 1e-9  # of a coordinate is the least size there
 LEAST_OVERLAP = 1e-3  # [of the smaller extent] media that overlap by less only touch
@@ -37,42 +36,25 @@ class Geometry(NamedTuple):
     """What kernels ask about a scene; coordinates are relative to the scene's centre.
 
     kind (m,), shape (m, 6), slack (m,), engine (m,) of media: kind, numbers, thickness of an exact boundary [unit],
-    ray-engine scene; planes (f, 4), plane_slack (f,), surface (f,) of facets: normal and height, thickness, surface;
-    balls (b, 4), ball_surface (b,): centre, radius, surface; reflectance (s, 3); field (x, y, z), field_low (3,),
-    field_step: distances of points of a grid to the nearest facet; field_beyond: distances outside it are at least
-    those to the grid; engines: the number of ray-engine scenes; solid: the
-    first of them is that of the surfaces.
+    ray-engine scene; grid: facets by cells, in which their meshes are the ray-engine scenes; surface (f,) of facets;
+    balls (b, 4), ball_surface (b,): centre, radius, surface; reflectance (s, 3); engines: the number of ray-engine
+    scenes; solid: the first of them is that of the surfaces.
     """
 
     kind: np.ndarray
     shape: np.ndarray
     slack: np.ndarray
     engine: np.ndarray
-    planes: np.ndarray
-    plane_slack: np.ndarray
+    grid: Grid
     surface: np.ndarray
     balls: np.ndarray
     ball_surface: np.ndarray
     reflectance: np.ndarray
-    field: np.ndarray
-    field_low: np.ndarray
-    field_step: float
-    field_beyond: bool
     engines: int
     solid: bool
 
 
 # ------------------------------------------------------------------------------------------- for kernels
-
-
-@njit(**KERNEL)
-def facet_hit(planes, facet, p, d):
-    """Return distance along d from p to a facet's plane, and the cosine of d to its normal."""
-    n = (planes[facet, 0], planes[facet, 1], planes[facet, 2])
-    cosine = dot(n, d)
-    if cosine == 0.0:
-        return math.inf, 0.0
-    return (planes[facet, 3] - dot(n, p)) / cosine, cosine
 
 
 @njit(**KERNEL)
@@ -145,19 +127,7 @@ def clearance(g, m, p):
     for b in range(g.balls.shape[0]):
         q = (p[0] - g.balls[b, 0], p[1] - g.balls[b, 1], p[2] - g.balls[b, 2])
         bound = min(bound, abs(math.sqrt(dot(q, q)) - g.balls[b, 3]))
-    nx, ny, nz = g.field.shape
-    if nx == 0:
-        return bound
-    h = g.field_step
-    x, y, z = (p[0] - g.field_low[0]) / h, (p[1] - g.field_low[1]) / h, (p[2] - g.field_low[2]) / h
-    if 0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz:
-        i, j, k = int(x), int(y), int(z)
-        x, y, z = x - i - 0.5, y - j - 0.5, z - k - 0.5
-        return min(bound, g.field[i, j, k] - h * math.sqrt(x * x + y * y + z * z))
-    if not g.field_beyond:
-        return 0.0
-    x, y, z = max(-x, x - nx, 0.0), max(-y, y - ny, 0.0), max(-z, z - nz, 0.0)
-    return min(bound, h * math.sqrt(x * x + y * y + z * z))
+    return min(bound, free_around(g.grid, p))
 
 
 # --------------------------------------------------------------------------------------------- from specs
@@ -215,7 +185,7 @@ class Place:
         if kind != MESH:
             return np.array([exact_depth(kind, self.arrays.shape[m], tuple(p)) > 0.0 for p in points], bool)
         row = int(self.arrays.engine[m])
-        return within(self.engines[row], self.arrays.planes[self.first_facet[row] :, :3], points)
+        return within(self.engines[row], self.arrays.grid.planes[self.first_facet[row] :, :3], points)
 
 
 def within(engine: Any, normals: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -389,23 +359,16 @@ def place(scene: Scene, grains: bool = False) -> Place:
         engines.append(triangle_scene(mesh.vertices, mesh.faces))
         first_facet.append(facets)
         facets += len(mesh.faces)
-    planes, plane_slack = _planes(meshes)
-    field, field_low, field_step, beyond = _field(meshes, low - centre, high - centre, scene)
     arrays = Geometry(
         kind=kind,
         shape=shape,
         slack=slack,
         engine=engine,
-        planes=planes,
-        plane_slack=plane_slack,
+        grid=_grid(meshes, low - centre, high - centre, scene),
         surface=np.concatenate(owners).astype(np.int32) if owners else np.zeros(0, np.int32),
         balls=places,
         ball_surface=np.array([i for i, _ in balls], np.int32),
         reflectance=np.array([s.reflectance for s in scene.surfaces], np.float64).reshape(-1, 3),
-        field=field,
-        field_low=field_low,
-        field_step=field_step,
-        field_beyond=beyond,
         engines=len(engines),
         solid=bool(solid),
     )
@@ -499,78 +462,16 @@ def planes_of(corners: np.ndarray) -> np.ndarray:
     return np.column_stack((normals, np.einsum("ij,ij->i", normals, corners.mean(axis=1))))
 
 
-def _field(
-    meshes: Sequence[Triangles], low: np.ndarray, high: np.ndarray, scene: Scene
-) -> tuple[np.ndarray, np.ndarray, float, bool]:
-    """Return the grid of distances to the nearest facet: distances, low corner, step, and if they bound those outside.
-
-    Of endless media the grid covers all facets, so that outside it the distance to the grid is a bound; media with an
-    extent lie wholly inside it.
-    """
-    if not meshes or not scene.media:
-        return np.zeros((0, 0, 0), np.float32), np.zeros(3), 1.0, True
+def _grid(meshes: Sequence[Triangles], low: np.ndarray, high: np.ndarray, scene: Scene) -> Grid:
+    """Return the grid over all media, which lie wholly inside it; where one is endless, over all facets."""
     endless = any(isinstance(medium.shape, Slab) for medium in scene.media)
     if endless:
         nothing = np.full(3, math.inf)
         low, high = _extent(nothing, -nothing, meshes)
-    size = np.maximum(high - low, 1e-3 * (high - low).max())
-    corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
-    ends = np.clip(corners, low, high)
-    sides = np.sort(ends.max(axis=1) - ends.min(axis=1), axis=1)
-    area = float((sides[:, 1] * sides[:, 2]).sum())  # of the facets in the grid, twice as much at most
-    h = max(float((size.prod() / FIELD_CELLS) ** (1 / 3)), math.sqrt(area / FIELD_FACETS))
-    counts = np.ceil(size / h).astype(int) + 2
-    low = 0.5 * (low + high) - 0.5 * counts * h
-    return distances(corners, low, h, counts), low, h, endless
-
-
-def distances(corners: np.ndarray, low: np.ndarray, step: float, counts: Sequence[int]) -> np.ndarray:
-    """Return float32 lower bounds of the distances of the cells' centres of a grid to the triangles that reach into it.
-
-    They are short by less than two cells' diagonals.
-
-    Parameters
-    ----------
-    corners : (m, 3, 3) float64
-        Of the triangles.
-    low : (3,) float64
-        Corner of the grid.
-    step : float
-        Edge of its cells.
-    counts : (3,) int
-        How many along each axis.
-    """
-    from scipy.ndimage import distance_transform_edt
-
-    high = low + step * np.asarray(counts)
-    free = np.ones(tuple(counts), bool)
-    waiting = [corners]
-    while waiting:
-        corners = waiting.pop()
-        least, most = (
-            extreme(extreme(*corners[:, :2].swapaxes(0, 1)), corners[:, 2]) for extreme in (np.minimum, np.maximum)
-        )
-        reaches = ((most >= low) & (least <= high)).all(axis=1)
-        corners, least, most = corners[reaches], least[reaches], most[reaches]
-        sides = [corners[:, i] - corners[:, i - 1] for i in range(3)]
-        edges = np.stack([np.einsum("ij,ij->i", side, side) for side in sides], axis=1)  # squared
-        small = (edges <= step * step).all(axis=1)
-        ends = [np.floor((extreme[small] - low) / step).astype(int) for extreme in (least, most)]
-        for choice in np.ndindex(2, 2, 2):  # a triangle no longer than a cell lies in at most eight
-            cell = np.stack([ends[choice[k]][:, k] for k in range(3)])
-            cell = cell[:, ((cell >= 0) & (cell < np.asarray(counts)[:, None])).all(axis=0)]
-            free[tuple(cell)] = False
-        # The others are cut across their longest edge
-        corners, longest = corners[~small], edges[~small].argmax(axis=1)
-        row = np.arange(len(corners))
-        a, b, c = (corners[row, (longest + k) % 3] for k in (-1, 0, 1))
-        middle = 0.5 * (a + b)
-        halves = np.concatenate((np.stack((a, middle, c), axis=1), np.stack((middle, b, c), axis=1)))
-        waiting += [halves[i : i + BATCH] for i in range(0, len(halves), BATCH)]
-    if free.all():
-        return np.full(tuple(counts), step * math.hypot(*counts), np.float32)
-    bounds = distance_transform_edt(free, sampling=step) - math.sqrt(0.75) * step
-    return np.maximum(bounds, 0.0).astype(np.float32)
+    corners = [mesh.vertices[mesh.faces] for mesh in meshes]
+    planes, thickness = _planes(meshes)
+    least = 0.5 * min((medium.radius for medium in scene.media), default=0.0)  # smaller ones are more to go through
+    return grid_of(corners, planes, thickness, (low, high), GRID_CELLS if scene.media else 0, least, endless)
 
 
 def _no_overlap(made: Place, scene: Scene, single: bool) -> None:

@@ -22,7 +22,22 @@ from tsdf.sampler import column_of, density, turned
 from tsdf.sampling import GOLDEN, mix, unit
 from tsdf.table import Table
 from tsdf.vectors import KERNEL, cross, dot, frame, step, triple
-from tsdf.walker import DIM, EVENTS, OTHER, PATIENCE, TRUNCATED, cast, copy, halves, lives, write
+from tsdf.walker import (
+    DIM,
+    ENDED,
+    EVENTS,
+    LOOK,
+    OTHER,
+    PATIENCE,
+    TRUNCATED,
+    WAIT,
+    born,
+    cast,
+    full,
+    halves,
+    lives,
+    write,
+)
 
 AIMED = 16  # records of each column of cos theta that light aimed at a lamp is drawn from
 
@@ -118,25 +133,27 @@ def begin(w, memory):
 
 
 @njit(**KERNEL)
-def connect(w, amounts, m, c, p, d, key, share, bound, room, media, memory, tables, lights, shadow, its_amounts):
-    """Start in `shadow` light that arrives from a light and is deflected into the walker's path by a grain; return
-    whether there is any.
+def connect(world, batch, w, amounts, p, c, share, bound):
+    """Send off light that arrives from a light and is deflected into the walker's path by a grain.
 
-    A bounding sphere with a grain of component c of medium m is entered at p by a walker along d; whichever sphere it
-    is, for the side on which it is entered is drawn anew. `share` is the probability that this is done at all.
+    A bounding sphere with a grain of component c of its medium is entered at p by the walker, whose key is for this;
+    whichever sphere it is, for the side on which it is entered is drawn anew. `share` is the probability that this is
+    done at all; nothing is nearer than `bound`.
     """
-    key = mix(key ^ OTHER)
+    media, memory, tables, room = world.media, world.memory, world.tables, world.room
+    m, d = w.medium, triple(w.d)
+    key = mix(w.key ^ OTHER)
     u0, u1 = halves(key)
     key += GOLDEN
     u2, u3 = halves(mix(key))
-    toward, light_pdf, light = draw_light(lights, u0, u1, u2)
+    toward, light_pdf, light = draw_light(world.lights, u0, u1, u2)
     if not light_pdf > 0.0:
-        return False
+        return
     cosine = min(max(dot(d, toward), -1.0), 1.0)
     column = column_of(tables, c, cosine)
     phase = memory.met[c] * density(tables, column)
     if not phase > 0.0:
-        return False
+        return
     number = memory.aimed[column, int(u3 * AIMED)]
     i, k = number // memory.grains.shape[2], number % memory.grains.shape[2]
     b, grain = float(memory.entered[c, i, k]), memory.grains[c, i, k]
@@ -155,14 +172,15 @@ def connect(w, amounts, m, c, p, d, key, share, bound, room, media, memory, tabl
     along = math.sqrt(max(0.0, 1.0 - b * b))
     centre = step(step(p, radius * along, d), -radius * b, t)
     if (bound <= 2.0 * radius or (room.kind[m] == MESH and not room.whole[m])) and not stands(room, m, centre):
-        return False
+        return
     up = cross(d, t)
     b_out = float(grain[6])
     along = math.sqrt(max(0.0, 1.0 - b_out * b_out))
     nx, ny = b_out * grain[3] + along * grain[0], b_out * grain[4] + along * grain[1]
     nz = b_out * grain[5] + along * grain[2]
     n = step(step(step((0.0, 0.0, 0.0), nx, t), ny, up), nz, d)
-    copy(its_amounts, amounts)
+    number = born(batch, amounts)
+    shadow, its_amounts = batch.out[number], batch.out_amounts[number]
     if media.slot[c] >= 0:
         its_amounts[media.slot[c]] += media.scale[c] * float(grain[7])
     cast(w, shadow, step(centre, radius, n), toward, light, phase / (light_pdf + phase) / share, m, key)
@@ -173,28 +191,19 @@ def connect(w, amounts, m, c, p, d, key, share, bound, room, media, memory, tabl
     gap, t, shadow.b = onward(memory, m, toward, t, min(b, 1.0), mix(shadow.key))
     write(shadow.t, t)
     shadow.free = radius * gap
-    return True
 
 
 @njit(**KERNEL)
-def roam(w, amounts, once, out, out_amounts, live, most, g, room, media, memory, tables, lights, absorption,
-         counters):  # fmt: skip
+def roam(world, batch, w, amounts, once):
     """Take a walker in a known medium from sphere to sphere while its flights can meet nothing else; as
-    `transport.wander`, but that a shadow ends at the first grain it meets.
-
-    Returns
-    -------
-    live : int
-        Walkers in `out`, shadows included.
-    state : int
-        0: the walker must look where it goes, 1: it must wait for its next turn, 2: it has ended.
-    """
+    `transport.wander`, but that a shadow ends at the first grain it meets. Returns LOOK, WAIT or ENDED."""
+    g, room, media, memory, tables = world.geometry, world.room, world.media, world.memory, world.tables
     m = w.medium
     p, d, t, b, key, free = triple(w.p), triple(w.d), triple(w.t), w.b, w.key, w.free
-    radius, sampled = memory.radius[m], lights.sampled and not w.shadow
+    radius, sampled = memory.radius[m], world.lights.sampled and not w.shadow
     first, last = media.first[m], media.first[m] + media.kinds[m] - 1
     mean, sure = media.free[m], room.whole[m] or room.kind[m] != MESH
-    luck, pdf, steps, met, state = w.luck, w.pdf, 0, 0, 0
+    luck, pdf, steps, met, state = w.luck, w.pdf, 0, 0, LOOK
     bound, fresh = clearance(g, m, p), True
     if free < 0.0:
         begin(w, memory)
@@ -205,8 +214,8 @@ def roam(w, amounts, once, out, out_amounts, live, most, g, room, media, memory,
                 bound = clearance(g, m, p)
             if bound <= free:
                 break
-        if steps >= PATIENCE or (live >= most and sampled):
-            state = 1
+        if steps >= PATIENCE or (sampled and not once and full(batch)):
+            state = WAIT
             break
         fresh = False
         steps += 1
@@ -225,8 +234,9 @@ def roam(w, amounts, once, out, out_amounts, live, most, g, room, media, memory,
             share = min(1.0, math.exp(0.5 * (2.0 * radius - bound) / mean))
             key += GOLDEN
             if unit(mix(key)) < share:
-                live += connect(w, amounts, m, c, p, d, key, share, bound, room, media, memory, tables, lights,
-                                out[live], out_amounts[live])  # fmt: skip
+                write(w.d, d)
+                w.key = key
+                connect(world, batch, w, amounts, p, c, share, bound)
 
         # Is there a grain in this sphere, and is it met?
         along = math.sqrt(max(0.0, 1.0 - b * b))
@@ -248,7 +258,7 @@ def roam(w, amounts, once, out, out_amounts, live, most, g, room, media, memory,
         if not there:
             through = 2.0 * along
         elif w.shadow:
-            state = 2
+            state = ENDED
             break
         else:
             met += 1
@@ -273,7 +283,7 @@ def roam(w, amounts, once, out, out_amounts, live, most, g, room, media, memory,
             if slot >= 0:
                 length = media.scale[c] * float(grain[7])
                 amounts[slot] += length
-                luck += absorption.least[slot] * length
+                luck += world.absorption.least[slot] * length
             key += GOLDEN
             bits = mix(key)
         gap, t, b = onward(memory, m, d, t, b, bits)
@@ -282,22 +292,22 @@ def roam(w, amounts, once, out, out_amounts, live, most, g, room, media, memory,
             w.luck = luck
             key += GOLDEN
             if not lives(w, key):
-                state = 2
+                state = ENDED
                 break
             luck = w.luck
         if w.events + met >= media.limit:
-            counters[TRUNCATED] += 1
-            state = 2
+            batch.counters[TRUNCATED] += 1
+            state = ENDED
             break
         if once:
             break
-    counters[EVENTS] += met
+    batch.counters[EVENTS] += met
     w.events += met
     write(w.p, p)
     write(w.d, d)
     write(w.t, t)
     w.b, w.key, w.free, w.luck, w.pdf = b, key, free, luck, pdf
-    return live, state
+    return state
 
 
 # ------------------------------------------------------------------------------------------- from tables

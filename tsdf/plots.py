@@ -15,6 +15,7 @@ import numpy as np
 from tsdf import analytic
 from tsdf.errors import UsageError
 from tsdf.files import replacing
+from tsdf.levels import LEVELS
 from tsdf.table import Table
 from tsdf.validate import ROUNDING, ZHOU_ETA, reference
 
@@ -32,16 +33,8 @@ STYLE: Any = {
     "mathtext.fontset": "dejavusans",
     "svg.hashsalt": "tsdf",
 }
-COLOURS = {  # of levels, to be told apart by all eyes (Okabe & Ito 2008)
-    "explicit": "#000000",
-    "teleport-memory": "#0072b2",
-    "teleport-joint": "#009e73",
-    "teleport": "#d55e00",
-    "volume": "#e69f00",
-    "volume-hg": "#cc79a7",
-    "isotropic": "#56b4e9",
-}
-MARKS = {"explicit": "s", "teleport-memory": "o", "teleport-joint": "^", "teleport": "v", "volume": "D"}
+COLOURS = {name: level.colour for name, level in LEVELS.items()}
+MARKS = {name: level.mark for name, level in LEVELS.items()}
 ANGLE_STYLES: Any = (("-", "full"), ("--", "none"))  # of lines and marks, by angle
 BAND = 0.18  # opacity of an error's band
 LINEAR = 1.0  # [%] deviations up to which an axis is linear, beyond it is logarithmic

@@ -20,6 +20,7 @@ import numpy as np
 from tsdf import transport as T
 from tsdf import walker as W
 from tsdf.errors import SceneError, UsageError
+from tsdf.handle import Handle
 from tsdf.transport import Camera
 from tsdf.world import World, camera_of, sees
 
@@ -75,55 +76,84 @@ class Picture:
 
 
 class Walkers:
-    """What one thread needs to follow light through a world."""
+    """What one thread needs to follow light through a world.
+
+    Attributes
+    ----------
+    walkers, amounts : lists of two arrays
+        Walkers under way, and what they were.
+    radiance : (n, 3) float64
+        Found so far by each sample; `reserve` makes room.
+    counters : (4,) int64
+        See `walker.EVENTS`.
+    """
 
     def __init__(self, world: World) -> None:
-        self.world = world
-        engines, exemplars = len(world.place.engines), len(world.packed.engines)
+        self.arrays = Handle(
+            T.WorldArrays(
+                world.place.arrays, world.place.room, world.media, world.tables, world.lights, world.packed.arrays,
+                world.memory, world.absorption,
+            )
+        )  # fmt: skip
+        self.place, self.packed = world.place, world.packed
+        engines, exemplars = len(self.place.engines), len(self.packed.engines)
         self.walkers = [np.zeros(ROOM, W.WALKER) for _ in range(2)]
         self.amounts = [np.zeros((ROOM, world.amounts)) for _ in range(2)]
-        self.hits = np.full((engines, ROOM), -1, np.int32)
+        self.hits = np.full((ROOM + 1, engines), -1, np.int32)
         self.grain_hits = np.full((exemplars, ROOM), -1, np.int32)
         self.starts, self.ways = (np.zeros((ROOM, 3), np.float32) for _ in range(2))
         self.grain_starts, self.grain_ways = (np.zeros((exemplars, ROOM, 3), np.float32) for _ in range(2))
-        self.asked = np.zeros(2 + exemplars, np.int64)
         self.counters = np.zeros(4, np.int64)
+        self.asked = np.zeros(W.GRAINS_ASKED + exemplars, np.int64)
+        self.radiance = np.zeros((0, 3))
+        self.reserve(1)
 
-    def follow(
-        self, camera: Camera, pixel: int, pixels: int, spp: int, sample: int, seed: int, stop: threading.Event
-    ) -> np.ndarray:
-        """Return the radiance (pixels, spp, 3) of samples `sample` .. sample + spp - 1 of consecutive pixels.
+    def reserve(self, samples: int) -> None:
+        """Let so many samples have found nothing yet."""
+        if len(self.radiance) < samples:
+            self.radiance = np.zeros((samples, 3))
+            self.batches = [Handle(batch) for batch in (self._batch(0, 1), self._batch(1, 0))]
+        self.radiance[:samples] = 0.0
+
+    def _batch(self, now: int, then: int) -> W.Batch:
+        return W.Batch(
+            self.walkers[now], self.amounts[now], self.walkers[then], self.amounts[then], self.hits, self.grain_hits,
+            self.starts, self.ways, self.grain_starts, self.grain_ways, self.radiance, self.counters, self.asked,
+        )  # fmt: skip
+
+    def follow(self, job: T.Job, pixels: int, stop: threading.Event) -> np.ndarray:
+        """Return the radiance (pixels, spp, 3) of the samples of a job, of so many pixels.
 
         Once `stop` is set it is worthless.
         """
-        total = pixels * spp
-        radiance = np.zeros((total, 3))
+        total = pixels * job.spp
+        self.reserve(total)
         first, live = 0, 0
         while (live or first < total) and not stop.is_set():
             if live <= SLOTS // 2 and first < total:
                 fresh = min(SLOTS - live, total - first)
-                T.spawn(first, fresh, pixel, spp, sample, seed, camera, self.walkers[0][live:], self.amounts[0][live:])
+                self.spawn(live, job, first, fresh)
                 first, live = first + fresh, live + fresh
-            live = self.turn(live, radiance)
-        return radiance.reshape(pixels, spp, 3)
+            live = self.turn(live)
+        return self.radiance[:total].reshape(pixels, job.spp, 3).copy()
 
-    def turn(self, live: int, radiance: np.ndarray) -> int:
+    def spawn(self, live: int, job: T.Job, first: int, count: int) -> None:
+        """Start walkers, behind the first `live` of ``walkers[0]``, for samples first .. first + count - 1 of a job."""
+        T.spawn(self.batches[0], live, job, first, count)
+
+    def turn(self, live: int) -> int:
         """Take the first `live` of ``walkers[0]`` as far as they come without the ray engine, ask it, and return how
         many go on; ``walkers[1]`` then holds what they were, those that have ended as they ended."""
-        w = self.world
-        T.advance(
-            live, self.walkers[0], self.amounts[0], self.walkers[1], self.amounts[1], self.hits, self.grain_hits,
-            self.starts, self.ways, self.grain_starts, self.grain_ways, w.place.arrays, w.place.room, w.media, w.tables,
-            w.lights, w.packed.arrays, w.memory, w.absorption, radiance, self.counters, self.asked,
-        )  # fmt: skip
+        T.advance(self.arrays, self.batches[0], live)
         live, rays = int(self.asked[W.LIVE]), int(self.asked[W.ASKED])
         if rays:
-            w.place.hits(self.starts[:rays], self.ways[:rays], self.hits)
+            self.place.hits(self.starts[:rays], self.ways[:rays], self.hits.T)
         for e, asked in enumerate(self.asked[W.GRAINS_ASKED :]):
             if asked:
-                self.grain_hits[e, :asked] = w.packed.hits(e, self.grain_starts[e, :asked], self.grain_ways[e, :asked])
-        self.walkers.reverse()
-        self.amounts.reverse()
+                starts, ways = self.grain_starts[e, :asked], self.grain_ways[e, :asked]
+                self.grain_hits[e, :asked] = self.packed.hits(e, starts, ways)
+        for pair in (self.batches, self.walkers, self.amounts):
+            pair.reverse()
         return live
 
 
@@ -193,7 +223,7 @@ def measure(
     total, squares = np.zeros((count, 3)), np.zeros((count, 3))
     samples = np.zeros(count, np.int64)
     pool = [Walkers(world) for _ in range(threads)]
-    pool[0].follow(camera, 0, 1, 1, 0, seed, halt)  # compiles, outside the time
+    pool[0].follow(T.Job(camera, 0, 1, 0, seed), 1, halt)  # compiles, outside the time
     for walkers in pool:
         walkers.counters[:] = 0
     free = list(pool)
@@ -202,7 +232,7 @@ def measure(
     def job(pixel: int, pixels: int, number: int, sample: int) -> np.ndarray:
         mine = free.pop()
         try:
-            return mine.follow(camera, pixel, pixels, number, sample, seed, halt)
+            return mine.follow(T.Job(camera, pixel, number, sample, seed), pixels, halt)
         finally:
             free.append(mine)
 

@@ -195,8 +195,8 @@ def room_of(
     media = len(kind)
     meshes = [(owner, corners, within) for owner, corners, within in meshes if len(corners)]
     if not meshes or not media:
-        nothing = np.zeros(0, np.int64)
-        return Room(kind, shape, radius, whole, balls, np.zeros((0, 3, 3)), np.zeros(0, np.int32), nothing, nothing,
+        nothing = np.zeros(0, np.int32)
+        return Room(kind, shape, radius, whole, balls, np.zeros((0, 3, 3)), nothing, np.zeros(0, np.int64), nothing,
                     np.zeros((media + 1, 0), bool), np.zeros(3), 1.0, np.zeros(3, np.int64))  # fmt: skip
     corners = np.concatenate([c for _, c, _ in meshes])
     owner = np.repeat([o for o, _, _ in meshes], [len(c) for _, c, _ in meshes]).astype(np.int32)

@@ -24,13 +24,14 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tsdf import levels
 from tsdf.errors import SceneError, UsageError
 from tsdf.materials import MEDIA, optical_constants
 from tsdf.medium import MAX_PACKING_FRACTION
 from tsdf.table import Table
 
 UP = ("z", "y")
-LEVELS = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume", "volume-hg", "isotropic")
+LEVELS = tuple(levels.LEVELS)
 INSIDE = ("grains", "centres")
 VISIBLE_NM = (380.0, 780.0)  # [nm] what an absorption spectrum must cover
 LARGEST = 1e30  # of any number in a scene, so that squares and products stay finite

@@ -17,44 +17,74 @@ from typing import NamedTuple
 from tsdf import explicit as X
 from tsdf import memory as M
 from tsdf.compiled import njit
-from tsdf.geometry import MESH, NONE, ball_hit, clearance, exact_hit, facet_hit
+from tsdf.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit
+from tsdf.grid import GRAZING, march, plane_hit
+from tsdf.lights import LightArrays
 from tsdf.lights import draw as draw_light
 from tsdf.lights import radiance as light_from
-from tsdf.sampler import column_of, density, draw_column, draw_length, draw_offset, draw_record, leave, turned
+from tsdf.room import Room
+from tsdf.sampler import (
+    Tables,
+    column_of,
+    density,
+    draw_column,
+    draw_length,
+    draw_offset,
+    draw_record,
+    leave,
+    turned,
+)
 from tsdf.sampling import GOLDEN, key_of, mix, unit
 from tsdf.vectors import KERNEL, cross, dot, frame, minus, step, triple
 from tsdf.walker import (
     ASKED,
+    CLEAR,
     DIM,
+    ENDED,
     EVENTS,
-    EXPLICIT,
     FAINT,
     FAULTS,
     FLY,
     GRAIN,
     GRAINS_ASKED,
-    GRAZING,
     JUMP,
     LIVE,
+    LOOK,
+    MOST,
     OTHER,
     PATIENCE,
     RAYS,
-    TELEPORT,
-    TELEPORT_JOINT,
-    TELEPORT_MEMORY,
     TRIES,
     TRUNCATED,
     UNKNOWN,
-    VOLUME,
-    VOLUME_HG,
+    WAIT,
+    Absorption,
+    Media,
+    born,
     cast,
     copy,
     find,
+    full,
     halves,
     lives,
     renewed,
     write,
 )  # fmt: skip
+
+HAIR = 1e-6  # of a boundary's thickness: an event nearer than this to it may be beyond it by rounding
+
+
+class WorldArrays(NamedTuple):
+    """What light meets, as kernels ask about it; see `handle`."""
+
+    geometry: Geometry
+    room: Room
+    media: Media
+    tables: Tables
+    lights: LightArrays
+    grains: X.Grains
+    memory: M.Memory
+    absorption: Absorption
 
 
 class Camera(NamedTuple):
@@ -68,6 +98,16 @@ class Camera(NamedTuple):
     right: tuple[float, float, float]
     down: tuple[float, float, float]
     width: int
+
+
+class Job(NamedTuple):
+    """Samples to take: `spp` of each pixel from `pixel` on, the first of them number `sample`."""
+
+    camera: Camera
+    pixel: int
+    spp: int
+    sample: int
+    seed: int
 
 
 @njit(forceinline=True, **KERNEL)
@@ -99,7 +139,7 @@ def bent(d, cosine, u):
 def offset_of(media, tables, c, column, key):
     """Draw r, z, phi_Delta and the path length [R] given the deflection, from the word of `key` and the next."""
     bits = mix(key)
-    if media.model == TELEPORT_JOINT:
+    if media.traits.joint:
         return draw_record(tables, column, unit(bits))
     u2, u3 = halves(bits)
     u4, u5 = halves(mix(key + GOLDEN))
@@ -111,36 +151,36 @@ def offset_of(media, tables, c, column, key):
 
 
 @njit(**KERNEL)
-def connect(w, amounts, m, p, d, c, key, share, bound, media, tables, lights, shadow, its_amounts):
-    """Start in `shadow` light that arrives from a light and is deflected into the walker's path by a grain; return
-    whether there is any.
+def connect(world, batch, w, amounts, p, c, share, bound):
+    """Send off light that arrives from a light and is deflected into the walker's path by a grain.
 
-    The grain, of component c in medium m, is entered at p by a walker along d. `share` is the probability that this is
-    done at all; nothing is nearer than `bound`.
+    The grain, of component c of the walker's medium, is entered at p by the walker; its key is for this. `share` is
+    the probability that this is done at all; nothing is nearer than `bound`.
     """
-    key = mix(key ^ OTHER)
+    media, tables, d = world.media, world.tables, triple(w.d)
+    key = mix(w.key ^ OTHER)
     u0, u1 = halves(key)
     key += GOLDEN
     bits = mix(key)
-    toward, light_pdf, light = draw_light(lights, u0, u1, unit(bits))
+    toward, light_pdf, light = draw_light(world.lights, u0, u1, unit(bits))
     if not light_pdf > 0.0:
-        return False
+        return
     cosine = dot(d, toward)
     column = 0
-    if media.model <= VOLUME:
+    if media.traits.tabulated:
         column = column_of(tables, c, min(max(cosine, -1.0), 1.0))
         phase = density(tables, column)
-    elif media.model == VOLUME_HG:
+    elif media.traits.lobe:
         phase = lobe_density(media.g[c], cosine)
     else:
         phase = 0.25 / math.pi
     if not phase > 0.0:
-        return False
-    weight = phase / (light_pdf + phase) / share
-    copy(its_amounts, amounts)
+        return
+    number = born(batch, amounts)
+    shadow, its_amounts = batch.out[number], batch.out_amounts[number]
     amount, offset = 1.0, (0.0, 0.0, 0.0)
     key += GOLDEN
-    if media.model <= TELEPORT_JOINT:
+    if media.traits.jumps:
         r, z, phi, length = offset_of(media, tables, c, column, key)
         key += GOLDEN
         side = step(toward, -cosine, d)
@@ -154,18 +194,17 @@ def connect(w, amounts, m, p, d, c, key, share, bound, media, tables, lights, sh
         amount = scale * length
         along, aside, up = z * scale, r * co * scale, r * si * scale
         offset = step(step((along * d[0], along * d[1], along * d[2]), aside, side), up, cross(d, side))
-    elif media.model == VOLUME:
+    elif media.traits.tabulated:
         amount = media.scale[c] * draw_length(tables, column, unit(mix(key))) if media.slot[c] >= 0 else 0.0
     if media.slot[c] >= 0:
         its_amounts[media.slot[c]] += amount
-    cast(w, shadow, p, toward, light, weight, m, key)
+    cast(w, shadow, p, toward, light, phase / (light_pdf + phase) / share, w.medium, key)
     size = math.sqrt(dot(offset, offset))
     if size > 0.0:
         if size < bound:
             write(shadow.p, step(p, 1.0, offset))
         else:
             aim(shadow, offset, size, toward, amount, c)
-    return True
 
 
 @njit(**KERNEL)
@@ -180,26 +219,52 @@ def aim(w, offset, size, d_out, amount, c):
 # ------------------------------------------------------------------------------------------ deep inside
 
 
+@njit(forceinline=True, **KERNEL)
+def deflection(world, c, u0, key):
+    """Return the cosine of the deflection by a grain of component c that u0 stands for, its density per steradian, -1
+    for an atom, r, z, phi_Delta and path length [R], 1 where there are none, and the key that is used up."""
+    media, tables = world.media, world.tables
+    traits, slot = media.traits, media.slot[c]
+    r, z, phi, length = 0.0, 0.0, 0.0, 1.0
+    if traits.tabulated:
+        column, cosine = draw_column(tables, c, u0)
+        pdf = density(tables, column)
+        if pdf <= 0.0:
+            pdf = -1.0
+        key += GOLDEN
+        bits = mix(key)
+        if traits.joint:
+            r, z, phi, length = draw_record(tables, column, unit(bits))
+        elif traits.jumps:
+            u2, u3 = halves(bits)
+            key += GOLDEN
+            u4, u5 = halves(mix(key))
+            r, z, phi = draw_offset(tables, column, u2, u3, u4)
+            if slot >= 0:
+                length = draw_length(tables, column, u5)
+        elif slot >= 0:
+            length = draw_length(tables, column, unit(bits))
+    elif traits.lobe:
+        cosine = lobe(media.g[c], u0)
+        pdf = lobe_density(media.g[c], cosine)
+    else:
+        cosine, pdf = 1.0 - 2.0 * u0, 0.25 / math.pi
+    return cosine, pdf, r, z, phi, length, key
+
+
 @njit(**KERNEL)
-def wander(w, amounts, once, out, out_amounts, live, most, g, media, tables, lights, absorption, counters):
+def wander(world, batch, w, amounts, once):
     """Take a walker that is in a known medium from event to event while nothing else can be met.
 
     With `once` it is known that the walker reaches the end of its free path: one event. A jump that may meet something
-    is left to `land`. The draws are written out here: a kernel that takes `tables` and is called once per event takes
-    twice the time.
-
-    Returns
-    -------
-    live : int
-        Walkers in `out`, shadows included.
-    state : int
-        0: the walker must look where it goes, 1: it must wait for its next turn, 2: it has ended.
+    is left to `land`. Returns LOOK, WAIT or ENDED.
     """
+    g, media, absorption, sampled = world.geometry, world.media, world.absorption, world.lights.sampled
     m = w.medium
     p, d, key, free = triple(w.p), triple(w.d), w.key, w.free
-    model, mean, reach, travel, sampled = media.model, media.free[m], media.reach[m], media.travel[m], lights.sampled
+    mean, reach, travel = media.free[m], media.reach[m], media.travel[m]
     first, last = media.first[m], media.first[m] + media.kinds[m] - 1
-    luck, pdf, steps, state = w.luck, w.pdf, 0, 0
+    luck, pdf, steps, state = w.luck, w.pdf, 0, LOOK
     patience = min(PATIENCE, media.limit - w.events)
     bound, fresh = clearance(g, m, p), True
     while True:
@@ -211,8 +276,8 @@ def wander(w, amounts, once, out, out_amounts, live, most, g, media, tables, lig
                 bound = clearance(g, m, p)
             if bound <= free:
                 break
-        if steps >= patience or live >= most:
-            state = 1
+        if steps >= patience or (not once and full(batch)):
+            state = WAIT
             break
         fresh = False
         steps += 1
@@ -229,48 +294,26 @@ def wander(w, amounts, once, out, out_amounts, live, most, g, media, tables, lig
             u = unit(mix(key))
             while c < last and u >= media.choice[c]:
                 c += 1
-        slot, scale = media.slot[c], media.scale[c]
         if sampled:
             if bound < 8.0 * mean:
                 bound = max(bound, clearance(g, m, p))
             share = min(1.0, math.exp((reach - bound) / mean))
             key += GOLDEN
             if unit(mix(key)) < share:
-                live += connect(w, amounts, m, p, d, c, key, share, bound, media, tables, lights,
-                                out[live], out_amounts[live])  # fmt: skip
+                write(w.d, d)
+                w.key = key
+                connect(world, batch, w, amounts, p, c, share, bound)
 
         key += GOLDEN
         u0, u1 = halves(mix(key))
-        r, z, phi, length = 0.0, 0.0, 0.0, 1.0
-        if model <= VOLUME:
-            column, cosine = draw_column(tables, c, u0)
-            pdf = density(tables, column)
-            if pdf <= 0.0:
-                pdf = -1.0
-            key += GOLDEN
-            bits = mix(key)
-            if model == TELEPORT_JOINT:
-                r, z, phi, length = draw_record(tables, column, unit(bits))
-            elif model == TELEPORT:
-                u2, u3 = halves(bits)
-                key += GOLDEN
-                u4, u5 = halves(mix(key))
-                r, z, phi = draw_offset(tables, column, u2, u3, u4)
-                if slot >= 0:
-                    length = draw_length(tables, column, u5)
-            elif slot >= 0:
-                length = draw_length(tables, column, unit(bits))
-        elif model == VOLUME_HG:
-            cosine = lobe(media.g[c], u0)
-            pdf = lobe_density(media.g[c], cosine)
-        else:
-            cosine, pdf = 1.0 - 2.0 * u0, 0.25 / math.pi
+        cosine, pdf, r, z, phi, length, key = deflection(world, c, u0, key)
         d, offset = leave(d, cosine, u1, r, z, phi)
         d = renewed(d)
-        if slot >= 0:
+        scale = media.scale[c]
+        if media.slot[c] >= 0:
             length *= scale
-            amounts[slot] += length
-            luck += absorption.least[slot] * length
+            amounts[media.slot[c]] += length
+            luck += absorption.least[media.slot[c]] * length
         if reach > 0.0:
             size = scale * math.sqrt(dot(offset, offset))
             if bound <= size:
@@ -285,20 +328,20 @@ def wander(w, amounts, once, out, out_amounts, live, most, g, media, tables, lig
             w.luck = luck
             key += GOLDEN
             if not lives(w, key):
-                state = 2
+                state = ENDED
                 break
             luck = w.luck
         if once:
             break
-    counters[EVENTS] += steps
+    batch.counters[EVENTS] += steps
     w.events += steps
     write(w.p, p)
     write(w.d, d)
     w.key, w.free, w.luck, w.pdf = key, free, luck, pdf
-    if state != 2 and w.events >= media.limit:
-        counters[TRUNCATED] += 1
-        state = 2
-    return live, state
+    if state != ENDED and w.events >= media.limit:
+        batch.counters[TRUNCATED] += 1
+        state = ENDED
+    return state
 
 
 # ---------------------------------------------------------------------------------------- where things are
@@ -309,14 +352,15 @@ def surface_met(g, p, d, hits, ray):
     """Return distance to the next opaque surface, its number, its normal against d, its thickness, and whether the ray
     engine named a facet that is behind p."""
     best, which, n, slack, spurious = math.inf, NONE, (0.0, 0.0, 0.0), 0.0, False
-    if g.solid and hits[0, ray] >= 0:
-        facet = hits[0, ray]
-        t, cosine = facet_hit(g.planes, facet, p, d)
-        slack = g.plane_slack[facet]
+    if g.solid and hits[ray, 0] >= 0:
+        facet = hits[ray, 0]
+        planes = g.grid.planes
+        t, cosine = plane_hit(planes, facet, p, d)
+        slack = g.grid.thickness[facet]
         if t < 0.0:
             spurious = True
         elif t < math.inf:
-            best, which, n = t, g.surface[facet], (g.planes[facet, 0], g.planes[facet, 1], g.planes[facet, 2])
+            best, which, n = t, g.surface[facet], (planes[facet, 0], planes[facet, 1], planes[facet, 2])
             if cosine > 0.0:
                 n = minus(n)
     if g.balls.shape[0] > 0:
@@ -332,18 +376,41 @@ def surface_met(g, p, d, hits, ray):
 
 
 @njit(**KERNEL)
-def boundary_met(g, m, p, d, hits, ray):
+def boundary_met(g, m, p, d, hits, ray, known):
     """Return distance to the next boundary of medium m, whether the ray is inside until then, the outward normal, the
-    boundary's thickness, and whether the ray engine named a facet that is behind p."""
+    boundary's thickness, and whether the ray engine named a facet that is behind p. Where no facet is met, the ray is
+    inside if that is `known`."""
     if g.kind[m] != MESH:
         t, inside, n = exact_hit(g.kind[m], g.shape[m], p, d)
         return t, inside, n, g.slack[m], False
-    facet = hits[g.engine[m], ray]
+    facet = hits[ray, g.engine[m]]
     if facet < 0:
-        return math.inf, False, (0.0, 0.0, 0.0), 0.0, False
-    t, cosine = facet_hit(g.planes, facet, p, d)
-    n = (g.planes[facet, 0], g.planes[facet, 1], g.planes[facet, 2])
-    return t, cosine > 0.0, n, g.plane_slack[facet], t < 0.0
+        return math.inf, known, (0.0, 0.0, 0.0), 0.0, False
+    planes = g.grid.planes
+    t, cosine = plane_hit(planes, facet, p, d)
+    n = (planes[facet, 0], planes[facet, 1], planes[facet, 2])
+    return t, cosine > 0.0, n, g.grid.thickness[facet], t < 0.0
+
+
+@njit(**KERNEL)
+def look(world, batch, w):
+    """See what a walker in a known medium meets next without the ray engine, and write it where answers of the ray
+    engine stand; return whether that was done. A flight ends with its free path, a jump with its length."""
+    g, traits = world.geometry, world.media.traits
+    end, way = math.inf, triple(w.d)
+    if w.mode == JUMP:
+        end, way = w.length, triple(w.e)
+    elif traits.packed:
+        pass
+    elif w.shadow and not traits.remembers:  # farther, it will not survive its roulette; see `pass_through`
+        end = world.media.free[w.medium] * math.log(w.weight / (FAINT * unit(mix(w.key + GOLDEN)) + 1e-300))
+    elif w.free >= 0.0:
+        end = w.free
+    spot = batch.hits.shape[0] - 1
+    if not march(g.grid, batch.hits[spot], triple(w.p), way, max(end, 0.0)):
+        return False
+    w.ray = spot
+    return True
 
 
 @njit(**KERNEL)
@@ -354,35 +421,33 @@ def beyond(slack, cosine):
 
 # ------------------------------------------------------------------------------------------- one walker
 
-GO_ON, LOOK_AGAIN, ENDED = 0, 1, 2
-
 
 @njit(**KERNEL)
-def bounce(w, amounts, p, d, t, n, slack, surface, out, out_amounts, live, g, lights):
-    """Put a walker that comes from p along d on a diffuse surface at distance t and send it on; return walkers in `out`
-    and what becomes of it."""
-    p = step(p, max(t - beyond(slack, dot(n, d)), 0.5 * t), d)
+def bounce(world, batch, w, amounts, d, met):
+    """Put a walker on a diffuse surface that it meets along d and send it on; return what becomes of it."""
+    t, surface, n, slack = met
+    p = step(triple(w.p), max(t - beyond(slack, dot(n, d)), 0.5 * t), d)
     before = max(w.colour[0], w.colour[1], w.colour[2])
     for k in range(3):
-        w.colour[k] *= g.reflectance[surface, k]
+        w.colour[k] *= world.geometry.reflectance[surface, k]
     after = max(w.colour[0], w.colour[1], w.colour[2])
     if after <= 0.0:
         w.weight = 0.0
-        return live, ENDED
+        return ENDED
     w.events += 1
     w.key += GOLDEN
     u0, u1 = halves(mix(w.key))
-    if lights.sampled:
+    if world.lights.sampled:
         w.key += GOLDEN
         u2, u3 = halves(mix(w.key))
         w.key += GOLDEN
-        toward, light_pdf, light = draw_light(lights, u2, u3, unit(mix(w.key)))
+        toward, light_pdf, light = draw_light(world.lights, u2, u3, unit(mix(w.key)))
         cosine = dot(n, toward)
         if light_pdf > 0.0 and cosine > 0.0:
             scattered = cosine / math.pi
-            copy(out_amounts[live], amounts)
-            cast(w, out[live], p, toward, light, scattered / (light_pdf + scattered), UNKNOWN, mix(w.key ^ OTHER))
-            live += 1
+            shadow = batch.out[born(batch, amounts)]
+            cast(w, shadow, p, toward, light, scattered / (light_pdf + scattered), UNKNOWN,
+                 mix(w.key ^ OTHER))  # fmt: skip
     cosine = math.sqrt(1.0 - u0)
     d = bent(n, cosine, u1)
     write(w.p, p)
@@ -392,81 +457,85 @@ def bounce(w, amounts, p, d, t, n, slack, surface, out, out_amounts, live, g, li
     if w.luck < DIM:
         w.key += GOLDEN
         if not lives(w, w.key):
-            return live, ENDED
-    return live, GO_ON
+            return ENDED
+    return LOOK
 
 
 @njit(**KERNEL)
-def again(w, slack, counters):
+def again(batch, w, slack):
     """Move the start of a walker's next ray beyond a facet that the ray engine sees and that is behind it."""
     w.skip = max(2.0 * w.skip, slack)
     w.tries += 1
     if w.tries > TRIES:
-        counters[FAULTS] += 1
+        batch.counters[FAULTS] += 1
         w.weight = 0.0
         return ENDED
-    return LOOK_AGAIN
+    return LOOK
 
 
 @njit(**KERNEL)
-def land(w, amounts, hits, out, out_amounts, live, g, media, lights, counters):
-    """End a walker's jump; return walkers in `out` and what becomes of it."""
+def land(world, batch, w, amounts):
+    """End a walker's jump; return what becomes of it."""
+    g, media, hits = world.geometry, world.media, batch.hits
     p, e, m = triple(w.p), triple(w.e), w.medium
     t, surface, n, slack, spurious = surface_met(g, p, e, hits, w.ray)
     if spurious:
-        return live, again(w, slack, counters)
-    t_b, inside, n_b, slack_b, spurious = boundary_met(g, m, p, e, hits, w.ray)
+        return again(batch, w, slack)
+    known = w.ray == hits.shape[0] - 1
+    t_b, inside, n_b, slack_b, spurious = boundary_met(g, m, p, e, hits, w.ray, known)
     if spurious:
-        return live, again(w, slack_b, counters)
+        return again(batch, w, slack_b)
     w.skip, w.tries = 0.0, 0
     if not inside:  # by rounding: the jump begins on the boundary
         t_b = 0.0
     leaves = t_b < w.length
     end = min(w.length, t_b)
+    slot = media.slot[w.component]
     if t < math.inf and (t - end) * abs(dot(n, e)) <= slack:
         if w.shadow:
-            return live, ENDED
-        if media.slot[w.component] >= 0:
-            amounts[media.slot[w.component]] -= w.gained * max(0.0, 1.0 - t / w.length)
-        return bounce(w, amounts, p, e, t, n, slack, surface, out, out_amounts, live, g, lights)
+            return ENDED
+        if slot >= 0:
+            amounts[slot] -= w.gained * max(0.0, 1.0 - t / w.length)
+        return bounce(world, batch, w, amounts, e, (t, surface, n, slack))
     move = min(beyond(slack_b, dot(n_b, e)), 0.5 * (t - t_b)) if inside else 0.0
     if leaves:
         for k in range(g.kind.shape[0]):
-            t_k, inside, n_k, slack_k, spurious = boundary_met(g, k, p, e, hits, w.ray)
+            t_k, inside, n_k, slack_k, spurious = boundary_met(g, k, p, e, hits, w.ray, False)
             if k != m and not inside and not spurious and abs(t_k - t_b) * abs(dot(n_k, e)) <= slack_b + slack_k:
                 # Another medium begins where this one ends: the grain lies in both
                 gone = min(t_b + move, w.length)
                 write(w.p, step(p, gone, e))
                 w.gained *= 1.0 - gone / w.length
                 w.medium, w.length = k, w.length - gone
-                return live, GO_ON
+                return LOOK
     write(w.d, triple(w.q))
     w.mode, w.free = FLY, -1.0
     if leaves:
-        if media.slot[w.component] >= 0:
-            amounts[media.slot[w.component]] -= w.gained * (1.0 - t_b / w.length)
+        if slot >= 0:
+            amounts[slot] -= w.gained * (1.0 - t_b / w.length)
         if dot(triple(w.q), n_b) < 0.0:
             move = -min(move, 0.5 * t_b)
         write(w.p, step(p, t_b + move, e))
         w.medium = UNKNOWN
     else:
         write(w.p, step(p, w.length, e))
-    return live, GO_ON
+    return LOOK
 
 
 @njit(**KERNEL)
-def fly(w, amounts, hits, out, out_amounts, live, g, room, media, tables, lights, grains, memory, absorption, radiance,
-        counters):  # fmt: skip
-    """Take a walker along its straight flight to what comes first; return walkers in `out` and what becomes of it."""
+def fly(world, batch, w, amounts):
+    """Take a walker along its straight flight to what comes first; return what becomes of it."""
+    g, media, hits = world.geometry, world.media, batch.hits
     p, d = triple(w.p), triple(w.d)
     t, surface, n, slack, spurious = surface_met(g, p, d, hits, w.ray)
     if spurious:
-        return live, again(w, slack, counters)
+        return again(batch, w, slack)
     home, t_b, n_b, slack_b = NONE, math.inf, n, 0.0
     for m in range(g.kind.shape[0]):
-        t_m, inside, n_m, slack_m, spurious = boundary_met(g, m, p, d, hits, w.ray)
+        known = m == w.medium and w.ray == hits.shape[0] - 1
+        t_m, inside, n_m, slack_m, spurious = boundary_met(g, m, p, d, hits, w.ray, known)
         if spurious:
-            return live, again(w, slack_m, counters)
+            return again(batch, w, slack_m)
         if home == NONE and (inside or t_m < t_b):
             t_b, n_b, slack_b = t_m, n_m, slack_m
             if inside:
@@ -475,68 +544,75 @@ def fly(w, amounts, hits, out, out_amounts, live, g, room, media, tables, lights
         w.free = -1.0
     w.skip, w.tries, w.medium = 0.0, 0, home
     facing = abs(dot(n, d)) if t < math.inf else 1.0
-    end = min(t, t_b)
     if home != NONE:
-        if media.model == EXPLICIT:
-            if w.shadow:
-                return live, ENDED
-            w.pdf = -1.0
-            s, centre, key = X.next_grain(grains, room, home, p, d, end)
-            if s < math.inf and (t - s) * facing > slack:
-                enter(w, grains, media, home, s, centre, key)
-                return live, GO_ON
-        elif media.model == TELEPORT_MEMORY:
-            if w.free < 0.0:
-                M.begin(w, memory)
-            if w.free < t_b and (t - w.free) * facing > slack:
-                live, state = M.roam(w, amounts, True, out, out_amounts, live, live + 2, g, room, media, memory, tables,
-                                     lights, absorption, counters)  # fmt: skip
-                return live, ENDED if state == 2 else GO_ON
-        elif w.shadow:
-            w.weight *= math.exp(-end / media.free[home])
-            if media.travel[home] >= 0:
-                amounts[media.travel[home]] += end
-            if w.weight < FAINT:
-                w.key += GOLDEN
-                if unit(mix(w.key)) * FAINT >= w.weight:
-                    return live, ENDED
-                w.weight = FAINT
-        else:
-            if w.free < 0.0:
-                w.key += GOLDEN
-                w.free = -media.free[home] * math.log(1.0 - unit(mix(w.key)))
-            if w.free < t_b and (t - w.free) * facing > slack:
-                live, state = wander(
-                    w, amounts, True, out, out_amounts, live, live + 2, g, media, tables, lights, absorption, counters
-                )
-                return live, ENDED if state == 2 else GO_ON
-            if media.travel[home] >= 0:
-                amounts[media.travel[home]] += end
-                w.luck += absorption.least[media.travel[home]] * end
+        state = pass_through(world, batch, w, amounts, t_b - HAIR * beyond(slack_b, dot(n_b, d)), t, slack / facing)
+        if state != CLEAR:
+            return state
     w.free = -1.0
     if t < math.inf and (t - t_b) * facing <= slack:
         if w.shadow:
-            return live, ENDED
-        return bounce(w, amounts, p, d, t, n, slack, surface, out, out_amounts, live, g, lights)
+            return ENDED
+        return bounce(world, batch, w, amounts, d, (t, surface, n, slack))
     if t_b < math.inf:
         write(w.p, step(p, t_b + min(beyond(slack_b, dot(n_b, d)), 0.5 * (t - t_b)), d))
         w.medium = UNKNOWN
         w.events += 1
         if w.events >= media.limit:
-            counters[TRUNCATED] += 1
-            return live, ENDED
-        return live, GO_ON
+            batch.counters[TRUNCATED] += 1
+            return ENDED
+        return LOOK
     if w.shadow:
-        find(w, 1.0, 1.0, 1.0, amounts, absorption, radiance)
+        find(world, batch, w, amounts, (1.0, 1.0, 1.0))
     else:
-        r, gr, b = light_from(lights, d, w.pdf)
-        find(w, r, gr, b, amounts, absorption, radiance)
-    return live, ENDED
+        find(world, batch, w, amounts, light_from(world.lights, d, w.pdf))
+    return ENDED
 
 
 @njit(**KERNEL)
-def enter(w, grains, media, m, s, centre, key):
+def pass_through(world, batch, w, amounts, t_b, t, thick):
+    """Take a walker through the medium that it is in, whose boundary is at distance t_b and, if at all, a surface at t,
+    that thick along the ray; return CLEAR if it comes through, else what becomes of it."""
+    media, m, end = world.media, w.medium, min(t, t_b)
+    if media.traits.packed:
+        if w.shadow:
+            return ENDED
+        w.pdf = -1.0
+        s, centre, key = X.next_grain(world.grains, world.room, m, triple(w.p), triple(w.d), end)
+        if s < math.inf and t - s > thick:
+            enter(world, w, s, centre, key)
+            return LOOK
+    elif media.traits.remembers:
+        if w.free < 0.0:
+            M.begin(w, world.memory)
+        if w.free < t_b and t - w.free > thick:
+            state = M.roam(world, batch, w, amounts, True)
+            return ENDED if state == ENDED else LOOK
+    elif w.shadow:
+        w.weight *= math.exp(-end / media.free[m])
+        if media.travel[m] >= 0:
+            amounts[media.travel[m]] += end
+        if w.weight < FAINT:
+            w.key += GOLDEN
+            if unit(mix(w.key)) * FAINT >= w.weight:
+                return ENDED
+            w.weight = FAINT
+    else:
+        if w.free < 0.0:
+            w.key += GOLDEN
+            w.free = -media.free[m] * math.log(1.0 - unit(mix(w.key)))
+        if w.free < t_b and t - w.free > thick:
+            state = wander(world, batch, w, amounts, True)
+            return ENDED if state == ENDED else LOOK
+        if media.travel[m] >= 0:
+            amounts[media.travel[m]] += end
+            w.luck += world.absorption.least[media.travel[m]] * end
+    return CLEAR
+
+
+@njit(**KERNEL)
+def enter(world, w, s, centre, key):
     """Bring a walker to a grain's bounding sphere at distance s and into the grain's frame."""
+    grains, media, m = world.grains, world.media, w.medium
     radius = grains.radius[m]
     x = step(step(triple(w.p), s, triple(w.d)), -1.0, centre)
     x = (x[0] / radius, x[1] / radius, x[2] / radius)
@@ -546,157 +622,175 @@ def enter(w, grains, media, m, s, centre, key):
     write(w.e, p)
     write(w.d, X.turned(key, triple(w.d), True))
     write(w.q, centre)
-    w.grain, w.mode, w.medium, w.state, w.facet, w.pdf = key, GRAIN, m, X.ENTERED, NONE, -1.0
+    w.grain, w.mode, w.state, w.facet, w.pdf = key, GRAIN, X.ENTERED, NONE, -1.0
     w.component = X.component_of(grains, media.first[m], media.kinds[m], key)
     w.ray = NONE
 
 
 @njit(**KERNEL)
-def in_grain(w, amounts, facet, grains, media, absorption, counters):
+def in_grain(world, batch, w, amounts, facet):
     """Take a walker through the next hit in its grain; return what becomes of it."""
-    c, radius = w.component, grains.radius[w.medium]
+    grains, media, c = world.grains, world.media, w.component
     p, d = triple(w.p), triple(w.d)
     met = w.facet >= 0 or facet >= 0
     if grains.exemplar[c] == X.EXACT_SPHERE:
         p, d, length, w.key = X.through_sphere(p, d, grains.eta[c], grains.kept_apart[c], w.key)
         state = X.LEFT
     else:
-        start, d, length, w.facet, state, w.key, fault = X.at_facet(
-            grains.planes, grains.centroids, facet, w.facet, p, d, grains.eta[c], w.state, w.key
-        )
-        write(w.e, start)
-        if state & X.RETRIED == 0:
-            p = start
+        p, d, length, state, fault = X.at_facet(grains, w, facet)
         if fault:
-            counters[FAULTS] += 1
+            batch.counters[FAULTS] += 1
     if media.slot[c] >= 0 and length > 0.0:
         amounts[media.slot[c]] += media.scale[c] * length
-        w.luck += absorption.least[media.slot[c]] * media.scale[c] * length
+        w.luck += world.absorption.least[media.slot[c]] * media.scale[c] * length
     w.state, w.ray = state, NONE
-    if state & X.LEFT:
-        if met or grains.exemplar[c] == X.EXACT_SPHERE:
-            counters[EVENTS] += 1
-            w.events += 1
-        p = step(p, X.rim_of(p, d), d)
-        out = X.turned(w.grain, p, False)
-        write(w.p, step(triple(w.q), radius, out))
-        write(w.d, renewed(X.turned(w.grain, d, False)))
-        w.mode, w.free = FLY, -1.0
-        if w.events >= media.limit:
-            counters[TRUNCATED] += 1
-            return ENDED
-        if w.luck < DIM:
-            w.key += GOLDEN
-            if not lives(w, w.key):
-                return ENDED
-    else:
+    if state & X.LEFT == 0:
         write(w.p, p)
         write(w.d, d)
-    return GO_ON
+        return LOOK
+    if met or grains.exemplar[c] == X.EXACT_SPHERE:
+        batch.counters[EVENTS] += 1
+        w.events += 1
+    p = step(p, X.rim_of(p, d), d)
+    out = X.turned(w.grain, p, False)
+    write(w.p, step(triple(w.q), grains.radius[w.medium], out))
+    write(w.d, renewed(X.turned(w.grain, d, False)))
+    w.mode, w.free = FLY, -1.0
+    if w.events >= media.limit:
+        batch.counters[TRUNCATED] += 1
+        return ENDED
+    if w.luck < DIM:
+        w.key += GOLDEN
+        if not lives(w, w.key):
+            return ENDED
+    return LOOK
 
 
 @njit(**KERNEL)
-def advance(count, walkers, amounts, out, out_amounts, hits, grain_hits, starts, ways, grain_starts, grain_ways,
-            g, room, media, tables, lights, grains, memory, absorption, radiance, counters, asked):  # fmt: skip
-    """Take each walker as far as it comes without the ray engine.
+def meet_grain(world, batch, w, amounts):
+    """Take a walker on in its grain, or ask the ray engine for the facet that it meets; return what becomes of it."""
+    e = world.grains.exemplar[w.component]
+    if e == X.EXACT_SPHERE:
+        return in_grain(world, batch, w, amounts, NONE)
+    if w.ray >= 0:
+        return in_grain(world, batch, w, amounts, batch.grain_hits[e, w.ray])
+    w.ray = batch.asked[GRAINS_ASKED + e]
+    for k in range(3):
+        batch.grain_starts[e, w.ray, k], batch.grain_ways[e, w.ray, k] = w.e[k], w.d[k]
+    batch.asked[GRAINS_ASKED + e] += 1
+    return WAIT
 
-    What goes on is written to out and out_amounts, the rays it needs to starts and ways (n, 3) float32, and for the
-    exemplars to grain_starts and grain_ways (e, n, 3). What has ended stays in `walkers`, the number of its sample
-    inverted (~sample); but for shadows, its weight is 0 unless it left the scene or reached the limit of events.
-    `asked` (2 + e,) int64 receives the numbers of walkers, of rays and of rays by exemplar.
+
+@njit(**KERNEL)
+def go_deep(world, batch, w, amounts):
+    """Take a walker in a known medium as far as it is sure to meet nothing; return CLEAR if it must look, else what
+    becomes of it."""
+    if world.media.traits.packed:
+        bound = clearance(world.geometry, w.medium, triple(w.p))
+        if bound > 0.0:
+            s, centre, key = X.next_grain(world.grains, world.room, w.medium, triple(w.p), triple(w.d), bound)
+            if s < math.inf:
+                enter(world, w, s, centre, key)
+                return LOOK
+        return CLEAR
+    if w.skip != 0.0:
+        return CLEAR
+    if world.media.traits.remembers:
+        state = M.roam(world, batch, w, amounts, False)
+    else:
+        state = wander(world, batch, w, amounts, False)
+    return CLEAR if state == LOOK else state
+
+
+@njit(**KERNEL)
+def ask(batch, w):
+    """Have the ray engine told what a walker looks along."""
+    way = triple(w.e) if w.mode == JUMP else triple(w.d)
+    w.ray = batch.asked[ASKED]
+    write(batch.starts[w.ray], step(triple(w.p), w.skip, way))
+    write(batch.ways[w.ray], way)
+    batch.asked[ASKED] += 1
+
+
+@njit(**KERNEL)
+def follow(world, batch, w, amounts):
+    """Take a walker as far as it comes without the ray engine; return ENDED or WAIT."""
+    engines, turns = world.geometry.engines > 0, 0
+    while True:
+        if w.mode == GRAIN:
+            state = meet_grain(world, batch, w, amounts)
+            if state != LOOK:
+                return state
+            continue
+        if w.mode == FLY and w.ray < 0 and w.medium >= 0 and (not w.shadow or world.media.traits.remembers):
+            state = go_deep(world, batch, w, amounts)
+            if state == LOOK:
+                turns += 1
+                if turns > PATIENCE:
+                    return WAIT
+                continue
+            if state != CLEAR:
+                return state
+        turns += 1
+        if (full(batch) and not w.shadow) or turns > PATIENCE:
+            w.ray = NONE  # by the next turn its answer is another's
+            return WAIT
+        if engines and w.ray < 0 and (w.medium < 0 or not look(world, batch, w)):
+            ask(batch, w)
+            return WAIT
+        state = land(world, batch, w, amounts) if w.mode == JUMP else fly(world, batch, w, amounts)
+        w.ray = NONE
+        if state == ENDED:
+            return ENDED
+
+
+@njit(**KERNEL)
+def keep(batch, w, amounts):
+    """Have a walker go on in the next turn."""
+    live = batch.asked[LIVE]
+    batch.out[live] = w
+    copy(batch.out_amounts[live], amounts)
+    batch.asked[LIVE] += 1
+
+
+@njit(**KERNEL)
+def advance(world, batch, count):
+    """Take each walker of a batch, the first `count`, as far as it comes without the ray engine.
+
+    What goes on is written to `out` and `out_amounts`, the rays it needs to `starts` and `ways`, and for the exemplars
+    to `grain_starts` and `grain_ways`; `asked` tells how many. What has ended stays in `walkers`, the number of its
+    sample inverted (~sample); but for shadows, its weight is 0 unless it left the scene or reached the limit of events.
     """
-    live, rays = 0, 0
+    asked = batch.asked
     for i in range(asked.shape[0]):
         asked[i] = 0
-    explicit, remembers = media.model == EXPLICIT, media.model == TELEPORT_MEMORY
     for i in range(count):
-        w, a = walkers[i], amounts[i]
-        most = out.shape[0] - (count - i) - 2
-        turns = 0
-        while True:
-            if w.mode == GRAIN:
-                e = grains.exemplar[w.component]
-                if w.ray < 0 and e != X.EXACT_SPHERE:
-                    w.ray = asked[GRAINS_ASKED + e]
-                    for k in range(3):
-                        grain_starts[e, w.ray, k], grain_ways[e, w.ray, k] = w.e[k], w.d[k]
-                    asked[GRAINS_ASKED + e] += 1
-                    break
-                facet = NONE if e == X.EXACT_SPHERE else grain_hits[e, w.ray]
-                status = in_grain(w, a, facet, grains, media, absorption, counters)
-                if status == ENDED:
-                    w.sample = ~w.sample
-                    break
-                continue
-            if w.mode == FLY and w.ray < 0 and w.medium >= 0 and (remembers or not w.shadow):
-                if explicit:
-                    bound = clearance(g, w.medium, triple(w.p))
-                    if bound > 0.0:
-                        s, centre, key = X.next_grain(grains, room, w.medium, triple(w.p), triple(w.d), bound)
-                        if s < math.inf:
-                            enter(w, grains, media, w.medium, s, centre, key)
-                            turns += 1
-                            if turns > PATIENCE:
-                                break
-                            continue
-                elif w.skip == 0.0:
-                    if remembers:
-                        live, state = M.roam(w, a, False, out, out_amounts, live, most, g, room, media, memory, tables,
-                                             lights, absorption, counters)  # fmt: skip
-                    else:
-                        live, state = wander(
-                            w, a, False, out, out_amounts, live, most, g, media, tables, lights, absorption, counters
-                        )
-                    if state == 2:
-                        w.sample = ~w.sample
-                        break
-                    if state == 1:
-                        break
-            turns += 1
-            if (g.engines > 0 and w.ray < 0) or (live >= most and not w.shadow) or turns > PATIENCE:
-                if g.engines > 0:
-                    way = triple(w.e) if w.mode == JUMP else triple(w.d)
-                    start = step(triple(w.p), w.skip, way)
-                    w.ray = rays
-                    write(starts[rays], start)
-                    write(ways[rays], way)
-                    rays += 1
-                break
-            if w.mode == JUMP:
-                live, status = land(w, a, hits, out, out_amounts, live, g, media, lights, counters)
-            else:
-                live, status = fly(w, a, hits, out, out_amounts, live, g, room, media, tables, lights, grains, memory,
-                                   absorption, radiance, counters)  # fmt: skip
-            w.ray = NONE
-            if status == ENDED:
-                w.sample = ~w.sample
-                break
-        if w.sample >= 0:
-            out[live] = w
-            copy(out_amounts[live], a)
-            live += 1
-    # Shadows that were born on the way have not looked yet
-    if g.engines > 0:
-        for i in range(live):
-            w = out[i]
-            if w.ray < 0 and w.mode != GRAIN:
-                way = triple(w.e) if w.mode == JUMP else triple(w.d)
-                w.ray = rays
-                write(starts[rays], step(triple(w.p), w.skip, way))
-                write(ways[rays], way)
-                rays += 1
-    counters[RAYS] += rays
-    asked[LIVE], asked[ASKED] = live, rays
+        w, amounts = batch.walkers[i], batch.amounts[i]
+        asked[MOST] = batch.out.shape[0] - (count - i) - 2
+        first = asked[LIVE]
+        state = follow(world, batch, w, amounts)
+        # The shadows that were born on the way
+        last, asked[LIVE] = asked[LIVE], first
+        for k in range(first, last):
+            if follow(world, batch, batch.out[k], batch.out_amounts[k]) != ENDED:
+                keep(batch, batch.out[k], batch.out_amounts[k])
+        if state == ENDED:
+            w.sample = ~w.sample
+        else:
+            keep(batch, w, amounts)
+    batch.counters[RAYS] += asked[ASKED]
 
 
 @njit(**KERNEL)
-def spawn(first, count, pixels, spp, sample, seed, camera, walkers, amounts):
-    """Start walkers for the samples first .. first + count - 1 of a job: sample i is of pixel pixels[0] + i // spp."""
+def spawn(batch, live, job, first, count):
+    """Start walkers, behind the first `live`, for the samples first .. first + count - 1 of a job: sample i is of pixel
+    pixel + i // spp."""
+    camera = job.camera
     for i in range(count):
         local = first + i
-        pixel = pixels + local // spp
-        w = walkers[i]
-        key = key_of(seed, pixel, sample + local % spp)
+        pixel = job.pixel + local // job.spp
+        w = batch.walkers[live + i]
+        key = key_of(job.seed, pixel, job.sample + local % job.spp)
         u0, u1 = halves(mix(key + GOLDEN))
         x, y = float(pixel % camera.width) + u0, float(pixel // camera.width) + u1
         d = step(step(camera.corner, x, camera.right), y, camera.down)
@@ -708,5 +802,5 @@ def spawn(first, count, pixels, spp, sample, seed, camera, walkers, amounts):
         w.weight, w.luck, w.pdf, w.free, w.skip = 1.0, 0.0, -1.0, -1.0, 0.0
         w.key, w.events, w.sample, w.ray, w.medium, w.mode = key + GOLDEN, 0, local, NONE, UNKNOWN, FLY
         w.tries, w.shadow = 0, 0
-        for k in range(amounts.shape[1]):
-            amounts[i, k] = 0.0
+        for k in range(batch.amounts.shape[1]):
+            batch.amounts[live + i, k] = 0.0

@@ -10,19 +10,9 @@ import numpy as np
 
 from tsdf.compiled import njit
 from tsdf.geometry import NONE
+from tsdf.levels import Traits
 from tsdf.sampling import mix, unit
 from tsdf.vectors import KERNEL, dot
-
-TELEPORT, TELEPORT_JOINT, VOLUME, VOLUME_HG, ISOTROPIC, EXPLICIT, TELEPORT_MEMORY = range(7)
-MODELS = {
-    "teleport": TELEPORT,
-    "teleport-joint": TELEPORT_JOINT,
-    "volume": VOLUME,
-    "volume-hg": VOLUME_HG,
-    "isotropic": ISOTROPIC,
-    "explicit": EXPLICIT,
-    "teleport-memory": TELEPORT_MEMORY,
-}
 
 WALKER = np.dtype(
     [("p", "3f8"), ("d", "3f8"), ("q", "3f8"), ("e", "3f8"), ("t", "3f8"), ("colour", "3f8"), ("weight", "f8"),
@@ -40,7 +30,8 @@ FLY, JUMP, GRAIN = 0, 1, 2
 UNKNOWN = -2  # medium of a walker that may have crossed a boundary
 
 EVENTS, RAYS, TRUNCATED, FAULTS = range(4)  # counters
-LIVE, ASKED, GRAINS_ASKED = range(3)  # what `advance` returns: walkers, rays to trace, then rays by exemplar
+LIVE, MOST, ASKED, GRAINS_ASKED = range(4)  # of `Batch.asked`
+CLEAR, LOOK, WAIT, ENDED = range(4)  # what becomes of a walker: it has met nothing yet, must look where it goes, ...
 
 OTHER = np.uint64(0xA5A5A5A5A5A5A5A5)
 LOW = np.uint64(0xFFFFFFFF)
@@ -50,20 +41,19 @@ MAX_EVENTS = 50_000_000  # of one path; only light that nothing lets out comes t
 DIM = math.log(0.25)  # walkers dimmer than this may end
 FAINT = 0.02  # shadows fainter than this may end
 TRIES = 8  # to start a ray off a facet, each twice as far from it
-GRAZING = 100.0  # times its thickness is the most that a point is moved off a facet along a ray
 
 
 class Media(NamedTuple):
     """What kernels ask about media (m,) and their components (c,).
 
-    model: one of the constants above for all media; free: mean free path; reach: the longest jump; first, kinds: its
+    traits: of the level, for all media; free: mean free path; reach: the longest jump; first, kinds: its
     first component and how many it has; travel: amount that counts the length flown, or -1. Of components: choice, the
     running sum of the probability that the next grain met is of it; scale: what one event's path length [R], or the
     event itself where there is none, counts in the amount `slot`; slot, -1 for none; g: mean cosine of the
     Henyey-Greenstein lobe. Lengths in scene units. limit: events after which a path is given up.
     """
 
-    model: int
+    traits: Traits
     free: np.ndarray
     reach: np.ndarray
     first: np.ndarray
@@ -84,6 +74,47 @@ class Absorption(NamedTuple):
     rgb: np.ndarray
     weight: np.ndarray
     least: np.ndarray
+
+
+class Batch(NamedTuple):
+    """The walkers that one thread takes on together, and what they ask the ray engine.
+
+    walkers (n,) and amounts (n, a) are those under way, out and out_amounts receive those that go on and the shadows
+    that are born; starts and ways (n, 3) float32 the rays in the scene, grain_starts and grain_ways (e, n, 3) those in
+    the exemplars, hits (n + 1, engines) and grain_hits (e, n) int32 the facets that they meet, the last of
+    hits those of the walker under way. radiance (samples, 3);
+    counters (4,): see EVENTS; asked (3 + e,): walkers in out, the number of them from which on no more are made, rays
+    asked for in the scene, and in each exemplar.
+    """
+
+    walkers: np.ndarray
+    amounts: np.ndarray
+    out: np.ndarray
+    out_amounts: np.ndarray
+    hits: np.ndarray
+    grain_hits: np.ndarray
+    starts: np.ndarray
+    ways: np.ndarray
+    grain_starts: np.ndarray
+    grain_ways: np.ndarray
+    radiance: np.ndarray
+    counters: np.ndarray
+    asked: np.ndarray
+
+
+@njit(**KERNEL)
+def full(batch):
+    """Return whether a batch has no room for more walkers."""
+    return batch.asked[LIVE] >= batch.asked[MOST]
+
+
+@njit(**KERNEL)
+def born(batch, amounts):
+    """Return the number in `out` of a new walker, whose amounts are those given."""
+    live = batch.asked[LIVE]
+    batch.asked[LIVE] += 1
+    copy(batch.out_amounts[live], amounts)
+    return live
 
 
 @njit(**KERNEL)
@@ -111,12 +142,11 @@ def absorbed(absorption, amounts):
 
 
 @njit(**KERNEL)
-def find(w, r, g, b, amounts, absorption, radiance):
+def find(world, batch, w, amounts, light):
     """Add light found by a walker to its sample."""
-    ar, ag, ab = absorbed(absorption, amounts)
-    radiance[w.sample, 0] += w.weight * w.colour[0] * r * ar
-    radiance[w.sample, 1] += w.weight * w.colour[1] * g * ag
-    radiance[w.sample, 2] += w.weight * w.colour[2] * b * ab
+    left = absorbed(world.absorption, amounts)
+    for k in range(3):
+        batch.radiance[w.sample, k] += w.weight * w.colour[k] * light[k] * left[k]
 
 
 @njit(forceinline=True, **KERNEL)

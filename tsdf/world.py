@@ -19,6 +19,7 @@ from tsdf.errors import SceneError, TSDFError
 from tsdf.explicit import Packed, nothing_packed, packed
 from tsdf.geometry import MESH, Place, Triangles, ball_hit, exact_hit, place
 from tsdf.grains import first_hit, load_grain
+from tsdf.levels import LEVELS, Traits
 from tsdf.lights import LUMINANCE, LightArrays, compile_lights
 from tsdf.medium import Component, VolumeParameters, free_path, volume_parameters
 from tsdf.memory import Memory, memory_of
@@ -42,25 +43,13 @@ from tsdf.scene import (
 from tsdf.table import Table
 from tsdf.transport import Camera
 from tsdf.vectors import frame
-from tsdf.walker import (
-    EXPLICIT,
-    ISOTROPIC,
-    MAX_EVENTS,
-    MODELS,
-    TELEPORT,
-    TELEPORT_JOINT,
-    TELEPORT_MEMORY,
-    VOLUME_HG,
-    Absorption,
-    Media,
-)  # fmt: skip
+from tsdf.walker import MAX_EVENTS, Absorption, Media
 
 CAPTIVES = 32  # paths that look for a way out from the camera
 BOUNCES = 500  # after which there is none; a hole of a thousandth of all surfaces is found by then
 SLOW = 1e5  # grains met by a path, beyond which it is said how long that takes
 ENDLESS = 1e7  # beyond which a path takes seconds
 EVENTS_PER_SECOND = 1e7  # of one thread, about
-MAX_PACKED = 8  # media of the explicit level
 DARKEST = 1e-300  # albedo, so that it has a logarithm
 FARTHEST = 1e300  # free path where nothing deflects, finite so that 0 of it is 0
 LOOKS = 200  # pixels along each side through which it is looked whether the camera sees anything
@@ -166,7 +155,7 @@ def _shut_in(world: World, camera: Camera) -> bool:
         if g.solid:
             facet = first_hit(place.engines[0], points, ways)
             met = np.flatnonzero(facet >= 0)
-            plane = g.planes[facet[met]]
+            plane = g.grid.planes[facet[met]]
             cosine = np.einsum("ij,ij->i", plane[:, :3], ways[met])
             distance[met] = (plane[:, 3] - np.einsum("ij,ij->i", plane[:, :3], points[met])) / cosine
             normal[met], owner[met] = plane[:, :3], g.surface[facet[met]]
@@ -222,9 +211,9 @@ def build(scene: Scene, level: str) -> World:
     SceneError, FormatError, UsageError
         In one line, for whatever makes the scene impossible at that level.
     """
-    if level not in MODELS:
-        raise SceneError(f"{scene.name}: no level {level!r}; levels are {', '.join(MODELS)}")
-    model = MODELS[level]
+    if level not in LEVELS:
+        raise SceneError(f"{scene.name}: no level {level!r}; levels are {', '.join(LEVELS)}")
+    traits = LEVELS[level].traits
     read: dict[str, Table] = {}
 
     def table_of(spec: GrainSpec) -> Table:
@@ -236,17 +225,17 @@ def build(scene: Scene, level: str) -> World:
         return read[file]
 
     tables = [table_of(grain) for medium in scene.media for grain in medium.grains]
-    made = place(scene, grains=model in (EXPLICIT, TELEPORT_MEMORY))
+    made = place(scene, grains=traits.placed)
     notes = list(made.notes)
-    media, absorption, parameters = _media(scene, model, tables)
-    if model == TELEPORT_JOINT:
+    media, absorption, parameters = _media(scene, traits, tables)
+    if records := LEVELS[level].records:
         for grain, table in zip((g for m in scene.media for g in m.grains), tables, strict=True):
-            if not table.joint:
+            if not getattr(table, records.block):
                 raise SceneError(
-                    f"{scene.name}: {grain.table} has no joint records, which level teleport-joint draws from; "
-                    "build it with --joint 32"
+                    f"{scene.name}: {grain.table} has no {records.name}, which level {level} draws from; "
+                    f"build it with {records.option}"
                 )
-    memory = _memory(scene, tables if model == TELEPORT_MEMORY else [])
+    memory = _memory(scene, tables if traits.remembers else [])
     for number, (medium, boundary) in enumerate(zip(scene.media, made.boundaries, strict=True), 1):
         extent = _extent(medium, boundary.vertices if boundary is not None else None)
         if 2.0 * medium.radius > extent and medium.inside == "grains":
@@ -254,28 +243,22 @@ def build(scene: Scene, level: str) -> World:
                 f"{scene.name}: [[medium]] {number} ({medium.name}): a grain of diameter {2.0 * medium.radius:g} does "
                 f"not fit into the medium, which is {extent:.3g} thin"
             )
-    notes += _long_paths(scene, model, tables, made, parameters)
+    notes += _long_paths(scene, traits, tables, made, parameters)
     lights, said = _lights(scene)
     notes += said
-    if model == EXPLICIT and scene.media and lights.sampled:
+    if traits.packed and scene.media and lights.sampled:
         notes.append(
             f"{scene.name}: level explicit meets suns and small bright lights by chance alone: until many samples "
             "have, the picture is too dark and its variance does not tell; widen the sun or light by a smooth sky"
         )
-    if model == EXPLICIT and len(scene.media) > MAX_PACKED:
-        raise SceneError(
-            f"{scene.name}: level explicit takes {MAX_PACKED} media at most, not {len(scene.media)}, for whose number "
-            "its kernels are compiled; join media, or take level teleport-memory"
-        )
-    single = model == EXPLICIT and scene.media
-    grains = packed(scene, tables) if single else nothing_packed(len(scene.media), len(tables))
+    grains = packed(scene, tables) if traits.packed and scene.media else nothing_packed(len(scene.media), len(tables))
     return World(
         scene=scene,
         level=level,
         place=made,
         packed=grains,
         media=media,
-        tables=compile_tables(tables or [_no_table()], joint=model == TELEPORT_JOINT),
+        tables=compile_tables(tables or [_no_table()], joint=traits.joint),
         memory=memory,
         lights=lights,
         absorption=absorption,
@@ -293,12 +276,6 @@ def _memory(scene: Scene, tables: list[Table]) -> Memory:
     for number, medium in enumerate(scene.media, 1):
         own = tables[at : at + len(medium.grains)]
         at += len(own)
-        for grain, table in zip(medium.grains, own, strict=True):
-            if not table.memory:
-                raise SceneError(
-                    f"{scene.name}: {grain.table} has no records by entry, which level teleport-memory draws from; "
-                    "build it with --memory 64"
-                )
         try:
             laws.append(law(medium.packing_fraction))
         except TSDFError as error:
@@ -346,7 +323,7 @@ def mean_chord(medium: MediumSpec, boundary: Triangles | None) -> float:
 
 
 def _long_paths(
-    scene: Scene, model: int, tables: list[Table], place: Place, parameters: Sequence[VolumeParameters]
+    scene: Scene, traits: Traits, tables: list[Table], place: Place, parameters: Sequence[VolumeParameters]
 ) -> list[str]:
     """Return what is to be said of media in which paths meet very many grains; SceneError where they hardly end."""
     notes, at = [], 0
@@ -356,7 +333,7 @@ def _long_paths(
         at += len(own)
         grains = [Component(table, grain.fraction, medium.radius) for grain, table in own]
         extinction = free_path(grains, medium.packing_fraction).sigma_t
-        if model == ISOTROPIC and volume.albedo > 0.0:
+        if traits.similar and volume.albedo > 0.0:
             extinction *= 1.0 - volume.g
         inside = bool(place.inside(m, camera[None])[0])
         events = grains_met(medium, place.boundaries[m], inside, extinction, volume.transport_mean_free_path)
@@ -435,7 +412,7 @@ def _spectra(spec: AbsorptionSpec, metres_per_unit: float | None) -> tuple[np.nd
     return absorption_at(spec, image.spectral_weights().wavelength_nm, metres_per_unit), np.zeros(3)
 
 
-def _media(scene: Scene, model: int, tables: list[Table]) -> tuple[Media, Absorption, tuple[VolumeParameters, ...]]:
+def _media(scene: Scene, traits: Traits, tables: list[Table]) -> tuple[Media, Absorption, tuple[VolumeParameters, ...]]:
     """Return media, absorption and volume parameters, with amounts only for what absorbs."""
     specs = [(medium, grain) for medium in scene.media for grain in medium.grains]
     spectra = [_spectra(grain.absorption, scene.metres_per_unit) for _, grain in specs]
@@ -467,23 +444,19 @@ def _media(scene: Scene, model: int, tables: list[Table]) -> tuple[Media, Absorp
         choice += list(np.cumsum(path.choice))
         mean_cosine = volume.g if volume.albedo > 0.0 else 0.0  # where no light leaves a grain any will do
         g += [mean_cosine] * len(components)
-        if model == ISOTROPIC:
+        if traits.similar:
             free.append(1.0 / max(volume.sigma_t * (1.0 - mean_cosine), 1.0 / FARTHEST))
         else:
-            free.append(
-                path.lambda_beta
-                if model in (TELEPORT, TELEPORT_JOINT, TELEPORT_MEMORY, EXPLICIT)
-                else 1.0 / volume.sigma_t
-            )
-        reach.append(LONGEST_OFFSET * medium.radius if model in (TELEPORT, TELEPORT_JOINT) else 0.0)
+            free.append(path.lambda_beta if traits.spheres else 1.0 / volume.sigma_t)
+        reach.append(LONGEST_OFFSET * medium.radius if traits.jumps else 0.0)
         flown_wavelength, flown_channel = np.zeros(len(weight)), np.zeros(3)
         for i, probability in zip(these, path.choice, strict=True):
-            scale.append(1.0 if model in (VOLUME_HG, ISOTROPIC) else medium.radius)
+            scale.append(1.0 if traits.points else medium.radius)
             if not absorbs[i]:
                 slots.append(-1)
                 continue
             by_wavelength, by_channel = spectra[i]
-            if model in (VOLUME_HG, ISOTROPIC):
+            if traits.points:
                 lossless = tables[i].albedo()
                 spectrum = np.zeros(0) if by_wavelength is None else by_wavelength
                 kept = [
@@ -497,13 +470,13 @@ def _media(scene: Scene, model: int, tables: list[Table]) -> tuple[Media, Absorp
             else:
                 slots.append(amount(None if by_wavelength is None else -by_wavelength, -by_channel))
         absorbing = any(absorbs[i] for i in these)
-        travel.append(amount(flown_wavelength, flown_channel) if model == ISOTROPIC and absorbing else -1)
+        travel.append(amount(flown_wavelength, flown_channel) if traits.similar and absorbing else -1)
         at += len(components)
     spectral = np.array([c[0] for c in columns]).T.reshape(len(weight), len(columns))
     rgb = np.array([c[1] for c in columns]).T.reshape(3, len(columns))
     least = rgb.max(axis=0) + (spectral.max(axis=0) if len(weight) else 0.0)
     media = Media(
-        model=model,
+        traits=traits,
         free=np.array(free),
         reach=np.array(reach),
         first=np.array(first, np.int64),

@@ -1,0 +1,297 @@
+"""Facets by the cells of a grid: how far the nearest is, which lie in a cell, and what a ray meets on its way.
+
+Where nothing is near, a ray goes as far as it is free at once; near facets it goes from cell to cell and looks at those
+that are listed there. Whether it passes within one is told by where its corners are, seen along the ray in float64,
+which facets see alike at the edges and corners that they share: none slips through between them. Distances are those of
+the facets' planes.
+A ray that would need many steps, or that leaves the grid where much is outside it, is left to the ray engine.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from tsdf.compiled import njit
+from tsdf.vectors import KERNEL, dot
+
+STEPS = 64  # of a ray through the grid; the ray engine is faster with those that need more
+OUTSIDE = 16  # facets that reach out of the grid, with more of which rays that leave it are left to the ray engine
+PAD = 0.004  # [cells] facets count as in a cell when this near to it, far more than the rounding of the way through
+GRAZING = 100.0  # times its thickness is the most that a point is moved off a facet along a ray
+NONE = -1
+
+
+class Grid(NamedTuple):
+    """What kernels ask about a grid of cells (x, y, z) over meshes' facets (f,).
+
+    low (3,), edge: its corner and the edge of a cell; free (x, y, z) float32: distances of the cells' middles to the
+    nearest facet, at most; first (x y z + 1,) int32, listed: the facets in each cell, one cell after the other; outer:
+    the facets that reach out of the grid, if there are no more than OUTSIDE; closed: rays that leave the grid meet
+    nothing else; beyond: distances outside it are at least those to the grid. corners (f, 3, 3); planes (f, 4): normal
+    and height over the origin; mesh (f,) int32: the number of the facet's mesh; thickness (f,): how near to it counts
+    as on it; margin: how far behind each other rays may meet facets, wholly inside the grid, that are at one place.
+    """
+
+    low: np.ndarray
+    edge: float
+    free: np.ndarray
+    first: np.ndarray
+    listed: np.ndarray
+    outer: np.ndarray
+    closed: bool
+    beyond: bool
+    corners: np.ndarray
+    planes: np.ndarray
+    mesh: np.ndarray
+    thickness: np.ndarray
+    margin: float
+
+
+# ------------------------------------------------------------------------------------------- for kernels
+
+
+@njit(**KERNEL)
+def plane_hit(planes, facet, p, d):
+    """Return distance along d from p to a facet's plane, and the cosine of d to its normal."""
+    n = (planes[facet, 0], planes[facet, 1], planes[facet, 2])
+    cosine = dot(n, d)
+    if cosine == 0.0:
+        return math.inf, 0.0
+    return (planes[facet, 3] - dot(n, p)) / cosine, cosine
+
+
+@njit(forceinline=True, **KERNEL)
+def turns(a, b):
+    """Return on which side of the edge from a to b, pairs of coordinates, the origin is; the opposite for the edge from
+    b to a, even where it is on it."""
+    area = a[0] * b[1] - a[1] * b[0]
+    if area != 0.0:
+        return area > 0.0
+    return a[0] < b[0] if a[0] != b[0] else a[1] < b[1]
+
+
+@njit(**KERNEL)
+def passes(corners, facet, p, d):
+    """Return whether the line through p along d passes within a facet: whether its corners, seen along d, turn around
+    p all one way (Woop et al. 2013)."""
+    i, j, k, u, v, w = 0, 1, 2, d[0], d[1], d[2]
+    x, y, z = p
+    if abs(d[0]) > max(abs(d[1]), abs(d[2])):
+        i, j, k, u, v, w = 1, 2, 0, d[1], d[2], d[0]
+        x, y, z = p[1], p[2], p[0]
+    elif abs(d[1]) > abs(d[2]):
+        i, j, k, u, v, w = 2, 0, 1, d[2], d[0], d[1]
+        x, y, z = p[2], p[0], p[1]
+    u, v = u / w, v / w
+    far = corners[facet, 0, k] - z
+    a = (corners[facet, 0, i] - x - u * far, corners[facet, 0, j] - y - v * far)
+    far = corners[facet, 1, k] - z
+    b = (corners[facet, 1, i] - x - u * far, corners[facet, 1, j] - y - v * far)
+    side = turns(a, b)
+    far = corners[facet, 2, k] - z
+    c = (corners[facet, 2, i] - x - u * far, corners[facet, 2, j] - y - v * far)
+    return turns(b, c) == side and turns(c, a) == side
+
+
+@njit(forceinline=True, **KERNEL)
+def inverse(x):
+    """Return 1 / x, a large number for 0."""
+    return 1.0 / x if abs(x) > 1e-300 else 1e300
+
+
+@njit(**KERNEL)
+def free_around(grid, p):
+    """Return a length within which no facet is around p."""
+    nx, ny, nz = grid.free.shape
+    if nx == 0:
+        return math.inf if grid.beyond else 0.0
+    h = grid.edge
+    x, y, z = (p[0] - grid.low[0]) / h, (p[1] - grid.low[1]) / h, (p[2] - grid.low[2]) / h
+    if 0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz:
+        i, j, k = int(x), int(y), int(z)
+        x, y, z = x - i - 0.5, y - j - 0.5, z - k - 0.5
+        bound = grid.free[i, j, k] - h * math.sqrt(x * x + y * y + z * z)
+        wall = h * (0.5 - max(max(abs(x), abs(y)), abs(z)))
+        if bound < wall:
+            # Nearer than the walls of the cell there are only its own, none nearer than its plane
+            cell = (i * ny + j) * nz + k
+            for at in range(grid.first[cell], grid.first[cell + 1]):
+                f = grid.listed[at]
+                n = (grid.planes[f, 0], grid.planes[f, 1], grid.planes[f, 2])
+                wall = min(wall, abs(dot(n, p) - grid.planes[f, 3]))
+            bound = max(bound, wall)
+        return bound
+    if not grid.beyond:
+        return 0.0
+    x, y, z = max(-x, x - nx, 0.0), max(-y, y - ny, 0.0), max(-z, z - nz, 0.0)
+    return h * math.sqrt(x * x + y * y + z * z)
+
+
+@njit(**KERNEL)
+def compared(grid, met, facet, p, d, end):
+    """Note a facet that a ray meets before `end` in `met` (meshes,), if it is the first of its mesh so far; return the
+    distance, or infinity."""
+    t, cosine = plane_hit(grid.planes, facet, p, d)
+    if not (0.0 <= t < end) or cosine == 0.0 or not passes(grid.corners, facet, p, d):
+        return math.inf
+    before = met[grid.mesh[facet]]
+    if before == NONE or t < plane_hit(grid.planes, before, p, d)[0]:
+        met[grid.mesh[facet]] = facet
+    return t
+
+
+@njit(**KERNEL)
+def march(grid, met, p, d, end):
+    """Note in `met` (meshes,) the first facets that a ray meets, NONE where there is none; return whether it is known.
+
+    What is met farther than `end`, or behind what is at the place of the first facet, may be missing.
+    """
+    for e in range(met.shape[0]):
+        met[e] = NONE
+    for at in range(grid.outer.shape[0]):
+        facet = grid.outer[at]
+        end = min(end, compared(grid, met, facet, p, d, end + GRAZING * grid.thickness[facet]))
+    end += grid.margin
+    nx, ny, nz = grid.free.shape
+    h = grid.edge
+    # The ray enters the grid at t and leaves it at `last`
+    t, last = 0.0, math.inf
+    x, y, z = (p[0] - grid.low[0]) / h, (p[1] - grid.low[1]) / h, (p[2] - grid.low[2]) / h
+    dx, dy, dz = d[0] / h, d[1] / h, d[2] / h
+    ix, iy, iz = inverse(dx), inverse(dy), inverse(dz)
+    a, b = -x * ix, (nx - x) * ix
+    t, last = max(t, min(a, b)), min(last, max(a, b))
+    a, b = -y * iy, (ny - y) * iy
+    t, last = max(t, min(a, b)), min(last, max(a, b))
+    a, b = -z * iz, (nz - z) * iz
+    t, last = max(t, min(a, b)), min(last, max(a, b))
+    if not grid.closed and (nx == 0 or t > 0.0 or last < end):
+        return False
+    for _ in range(STEPS):
+        if not t <= min(last, end):
+            return True
+        ux, uy, uz = x + t * dx, y + t * dy, z + t * dz
+        i, j, k = min(max(int(ux), 0), nx - 1), min(max(int(uy), 0), ny - 1), min(max(int(uz), 0), nz - 1)
+        cell = (i * ny + j) * nz + k
+        here, there = grid.first[cell], grid.first[cell + 1]
+        if here == there:
+            ux, uy, uz = ux - i - 0.5, uy - j - 0.5, uz - k - 0.5
+            free = grid.free[i, j, k] - h * math.sqrt(ux * ux + uy * uy + uz * uz)
+            if free > h:
+                t += free
+                continue
+        for at in range(here, there):
+            end = min(end, compared(grid, met, grid.listed[at], p, d, end) + grid.margin)
+        a = (i + (1.0 if dx >= 0.0 else 0.0) - x) * ix
+        b = (j + (1.0 if dy >= 0.0 else 0.0) - y) * iy
+        c = (k + (1.0 if dz >= 0.0 else 0.0) - z) * iz
+        t = max(t, min(a, min(b, c))) + 1e-6 * h
+    return False
+
+
+# --------------------------------------------------------------------------------------------- from meshes
+
+
+def grid_of(meshes: Sequence[np.ndarray], planes: np.ndarray, thickness: np.ndarray,
+            box: tuple[np.ndarray, np.ndarray], cells: int, least: float, beyond: bool) -> Grid:  # fmt: skip
+    """Return the grid over a box.
+
+    Parameters
+    ----------
+    meshes : sequence of (f, 3, 3) float64
+        Corners of the facets of each mesh.
+    planes : (all f, 4) float64
+        Unit normal, and height over the origin, of each facet.
+    thickness : (all f,) float64
+        How near to it counts as on it.
+    box : two (3,) arrays
+        Its low and high corner.
+    cells : int
+        About how many; none makes no grid, and leaves all to the ray engine.
+    least : float
+        The edge of a cell, at least.
+    beyond : bool
+        The box holds all facets.
+    """
+    corners = np.concatenate([np.zeros((0, 3, 3)), *meshes])
+    mesh = np.repeat(np.arange(len(meshes)), [len(each) for each in meshes]).astype(np.int32)
+    low, high = box
+    if not len(corners) or not cells:
+        nothing = np.zeros(0, np.int32)
+        return Grid(np.zeros(3), 1.0, np.zeros((0, 0, 0), np.float32), np.zeros(1, np.int32), nothing, nothing,
+                    not len(corners), not len(corners), corners, planes, mesh, thickness, 0.0)  # fmt: skip
+    size = np.maximum(high - low, 1e-3 * (high - low).max())
+    edge = max(float((size.prod() / cells) ** (1 / 3)), least)
+    counts = np.ceil(size / edge).astype(int) + 2
+    low = 0.5 * (low + high) - 0.5 * counts * edge
+    free, first, listed = cells_of(corners, planes, low, edge, counts)
+    outer = ((corners < low + edge) | (corners > low + (counts - 1) * edge)).any(axis=(1, 2))
+    margin = 2.0 * GRAZING * float(thickness[~outer].max(initial=0.0))
+    few = int(outer.sum()) <= OUTSIDE
+    return Grid(low, edge, free, first, listed, outer.nonzero()[0].astype(np.int32)[: OUTSIDE * few], few, beyond,
+                corners, planes, mesh, thickness, margin)  # fmt: skip
+
+
+def cells_of(
+    corners: np.ndarray, planes: np.ndarray, low: np.ndarray, edge: float, counts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return float32 lower bounds of the distances of the cells' middles of a grid to the triangles that reach into it,
+    short by less than two cells' diagonals, and the triangles in each cell, as `Grid` has them.
+
+    Parameters
+    ----------
+    corners : (m, 3, 3) float64
+        Of the triangles.
+    planes : (m, 4) float64
+        Unit normal, and height over the origin, of each.
+    low : (3,) float64
+        Corner of the grid.
+    edge : float
+        Of its cells.
+    counts : (3,) int
+        How many along each axis.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    high, pad = low + edge * counts, PAD * edge
+    number, found = np.arange(len(corners)), [np.zeros(0, np.int64)]
+    while len(corners):
+        least, most = (
+            extreme(extreme(*corners[:, :2].swapaxes(0, 1)), corners[:, 2]) for extreme in (np.minimum, np.maximum)
+        )
+        least, most = least - pad, most + pad
+        reaches = ((most >= low) & (least <= high)).all(axis=1)
+        corners, number, least, most = corners[reaches], number[reaches], least[reaches], most[reaches]
+        sides = [corners[:, i] - corners[:, i - 1] for i in range(3)]
+        edges = np.stack([np.einsum("ij,ij->i", side, side) for side in sides], axis=1)  # squared
+        small = (edges <= ((1.0 - 3.0 * PAD) * edge) ** 2).all(axis=1)
+        ends = [np.floor((extreme[small] - low) / edge).astype(int) for extreme in (least, most)]
+        pieces = []
+        for choice in np.ndindex(2, 2, 2):  # a triangle no longer than a cell lies in at most eight
+            cell = np.stack([ends[choice[k]][:, k] for k in range(3)])
+            within = ((cell >= 0) & (cell < counts[:, None])).all(axis=0)
+            pieces.append(np.ravel_multi_index(tuple(cell[:, within]), tuple(counts)) << 32 | number[small][within])
+        found.append(np.unique(np.concatenate(pieces)))
+        # The others are cut across their longest edge
+        corners, longest, number = corners[~small], edges[~small].argmax(axis=1), number[~small]
+        row = np.arange(len(corners))
+        a, b, c = (corners[row, (longest + k) % 3] for k in (-1, 0, 1))
+        middle = 0.5 * (a + b)
+        corners = np.concatenate((np.stack((a, middle, c), axis=1), np.stack((middle, b, c), axis=1)))
+        number = np.concatenate((number, number))
+    both = np.unique(np.concatenate(found))
+    cell, listed = both >> 32, (both & 0xFFFFFFFF).astype(np.int32)
+    # Only those cells that a triangle's plane comes through
+    middles = low + (np.stack(np.unravel_index(cell, tuple(counts)), axis=1) + 0.5) * edge
+    height = np.einsum("ij,ij->i", planes[listed, :3], middles) - planes[listed, 3]
+    through = np.abs(height) <= (0.5 + PAD) * edge * np.abs(planes[listed, :3]).sum(axis=1)
+    cell, listed = cell[through], listed[through]
+    first = np.zeros(int(counts.prod()) + 1, np.int32)
+    first[1:] = np.cumsum(np.bincount(cell, minlength=len(first) - 1))
+    empty = (first[1:] == first[:-1]).reshape(tuple(counts))
+    if not len(listed):
+        return np.full(tuple(counts), edge * math.hypot(*counts), np.float32), first, listed
+    bounds = distance_transform_edt(empty, sampling=edge) - math.sqrt(0.75) * edge
+    return np.maximum(bounds, 0.0).astype(np.float32), first, listed
