@@ -5,7 +5,9 @@ drawing an event alone (`bench_sampler`). (b) Time to equal variance of multiply
 teleport. Multiply scattered light is the diffuse reflectance of a thick slab of lossless grains: light that a grain
 sends back at its first event is a few per cent of it, and its share is stated. (c) Beside each, a furnace of radiance
 1 around the same grains, which must read 1: a fast wrong answer shows. (d) The explicit level's rays per second against
-what the ray engine alone makes of the very same rays. What is compared runs in turn in one process; numbers are medians
+what the ray engine alone makes of the very same rays. (e) Where pictures are made: a cube of 4 R, balls of 80 to
+80,000 facets and grains of 1/10 to 1/10,000 of them, beside the bulk, and the scenes of scenes/ where `make demo` has
+made their tables. What is compared runs in turn in one process; numbers are medians
 over rounds, ratios medians of the ratios of a round. Where others share the machine, processor time is steadier than
 the wall's: (b) and (d) use it, (a) gives both, and the scaling of two kernels that share nothing, which is what the
 machine has to give.
@@ -26,12 +28,15 @@ import numpy as np
 from bench_sampler import algorithm_1, built, henyey_greenstein, joint_records
 
 from tsdf import image, render, world
+from tsdf.errors import TSDFError
 from tsdf.grains import load_grain
 from tsdf.optics import Optics
 from tsdf.render import Picture, Walkers
 from tsdf.sampler import compile_tables
 from tsdf.scatterometer import Build, Effort, exact_sphere
 from tsdf.scene import (
+    Absorption,
+    Box,
     Camera,
     ConstantLight,
     EnvironmentLight,
@@ -39,9 +44,13 @@ from tsdf.scene import (
     Light,
     MediumShape,
     MediumSpec,
+    Mesh,
     Scene,
     Slab,
     Sphere,
+    SunLight,
+    load,
+    resized,
 )
 from tsdf.table import Table
 from tsdf.transport import EVENTS, Job
@@ -54,6 +63,12 @@ ETA = 1.31
 DEEP = ("teleport", "teleport-memory", "teleport-joint", "volume", "volume-hg", "isotropic")
 DRAWS = {"teleport": "Algorithm 1", "teleport-joint": "joint records", "volume-hg": "Henyey-Greenstein"}
 MEMORY = 64  # records per cell of entry
+SCENES = Path(__file__).parent.parent / "scenes"
+SHIPPED = {
+    "snow": ("teleport", "teleport-memory"),
+    "sand": ("teleport", "teleport-memory"),
+    "beads": ("teleport", "teleport-memory", "explicit"),
+}
 GOALS = {"events": 10e6, "scaling": 1.7, "gain": 10.0}
 
 
@@ -258,6 +273,64 @@ def rays(table: Table, rounds: int, samples: int) -> str:
     )
 
 
+def outlook(table: Table, shape: MediumShape, size: float, radius: float, light: Light) -> Scene:
+    """Return grains in a shape of a size about the origin, seen whole from outside in 160 x 90 pixels; they absorb a
+    little, or light would stay in large bodies for ever."""
+    grain = GrainSpec(table, absorption=Absorption("grey", (0.02 / radius,)))
+    medium = MediumSpec(shape, FRACTION, radius, (grain,), name="grains")
+    camera = Camera((0.0, -4.0 * size, 1.2 * size), (0.0, 0.0, 0.0), 160, 90)
+    return Scene(camera, (light,), (medium,), name="bench")
+
+
+def near(table: Table, rounds: int, spp: int, folder: Path) -> list[str]:
+    """Return lines about processor time per sample and per event where boundaries are near, beside the bulk's."""
+    import trimesh
+
+    white, sun = ConstantLight((1.0, 1.0, 1.0)), SunLight((-0.48, -0.36, 0.8), (3.0, 3.0, 3.0))
+    box = Box((-4.0, -4.0, -4.0), (4.0, 4.0, 4.0))
+    bulk = world.build(scene(table, Sphere((0.0, 0.0, 0.0), LARGE), white), "teleport")
+    made = {
+        f"cube of half side 4 R, {name}, {level}": world.build(outlook(table, box, 4.0, 1.0, light), level)
+        for name, light in (("constant", white), ("sun", sun))
+        for level in ("teleport", "teleport-memory")
+    }
+    for subdivisions in (1, 3, 6):
+        mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
+        mesh.export(folder / f"{subdivisions}.ply")
+        for radius in (1e-1, 1e-2, 1e-4):
+            one = outlook(table, Mesh(folder / f"{subdivisions}.ply"), 1.0, radius, sun)
+            made[f"ball of {len(mesh.faces)} facets, grains of {radius:g}, sun"] = world.build(one, "teleport")
+    for name, levels in SHIPPED.items():
+        try:
+            shipped = resized(load(SCENES / f"{name}.toml"), 160)
+            made |= {f"{name}.toml, {level}": world.build(shipped, level) for level in levels}
+        except TSDFError:
+            print(f"{name}.toml is left out: make demo makes its tables")
+    for one in (bulk, *made.values()):
+        render.render(one, spp=1, threads=1)
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in made}
+    shares: dict[str, list[float]] = {name: [] for name in made}
+    for k in range(rounds):
+        deep, cpu = cost(bulk, 4096, k)
+        base = cpu / deep.events
+        for name, one in made.items():
+            picture, cpu = cost(one, spp, k)
+            times[name].append((1e6 * cpu / picture.samples.sum(), 1e9 * cpu / picture.events))
+            shares[name].append(cpu / picture.events / base)
+    text = ["| scene | CPU us per sample | ns per event | over the bulk's |", "|---|---|---|---|"]
+    for name in made:
+        sample, event = (statistics.median(column) for column in zip(*times[name], strict=True))
+        text.append(f"| {name} | {sample:.2f} | {event:.0f} | {statistics.median(shares[name]):.1f} |")
+    return text
+
+
+def cost(made: world.World, spp: int, seed: int) -> tuple[Picture, float]:
+    """Return a picture by one thread and its processor time."""
+    start = time.process_time()
+    picture = render.render(made, spp=spp, threads=1, seed=seed)
+    return picture, time.process_time() - start
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="fewer rounds, fewer events")
@@ -283,6 +356,7 @@ def main() -> None:
     table = faceted()
     with tempfile.TemporaryDirectory() as folder:
         lines, gain = equal_variance(table, rounds, seconds, Path(folder))
+        boundaries = near(tables["exact sphere"], rounds, 4 if given.quick else 8, Path(folder))
     text += [
         "",
         f"## Multiply scattered light: a slab of {THICK:.0f} R, grains of 20,480 facets, one thread",
@@ -292,6 +366,10 @@ def main() -> None:
         f"Teleport takes 1/{gain:.1f} of the time of explicit to equal variance.",
         "",
         rays(table, 3, 4096 if given.quick else 8192),
+        "",
+        "## Near boundaries: whole pictures, one thread",
+        "",
+        *boundaries,
     ]
     (given.out / "render.md").write_text("\n".join(text) + "\n")
     print("\n".join(text))
