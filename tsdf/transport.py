@@ -3,7 +3,8 @@
 A walker is one sample of one pixel, followed backwards from the camera. All levels share its states: it flies straight,
 it jumps from where light enters a grain's bounding sphere to where it leaves it, or it is in a grain of the explicit
 level. Deep inside a medium, farther from everything than the next event can take it, it takes step after step without
-the ray engine. A shadow is a walker that flies toward a light and loses weight or ends on its way.
+looking. Near a mesh it looks along short ways by the grid (`grid`); what is long, or starts in an unknown medium, waits
+for the ray engine. A shadow is a walker that flies toward a light and loses weight or ends on its way.
 
 The rules at boundaries are those of Meng et al. 2015 (supplemental): a jump that meets a surface ends there, as an
 ordinary surface vertex; one that leaves the medium ends on its boundary, which is index-matched. No point is ever moved
