@@ -57,7 +57,7 @@ LAYERS = [
     {"accuracy", "compare"},
 ]
 DOORS = {
-    "numba": {"compiled"},
+    "numba": {"compiled", "handle"},
     "DracoPy": {"gltf"},
     "collada": {"meshes"},
     "mapbox_earcut": {"polygons"},

@@ -264,8 +264,7 @@ def bulk_experiment(
     level: str, grain: GrainSpec, fraction: float, packing: int = 0, block: int = BLOCK, blocks: int = BLOCKS
 ) -> Experiment:
     """Return what `diffusion` measures."""
-    world = build(scene_of(Sphere((0.0, 0.0, 0.0), FAR), grain, fraction, packing), level)
-    world = replace(world, media=world.media._replace(limit=block))
+    world = build(scene_of(Sphere((0.0, 0.0, 0.0), FAR), grain, fraction, packing), level, limit=block)
 
     def read(places: np.ndarray, ends: Ends) -> np.ndarray:
         steps = np.diff(places, axis=1)

@@ -203,8 +203,15 @@ def _triple(v: np.ndarray) -> tuple[float, float, float]:
     return float(v[0]), float(v[1]), float(v[2])
 
 
-def build(scene: Scene, level: str) -> World:
+def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
     """Return a scene ready to be rendered at a level.
+
+    Parameters
+    ----------
+    scene : Scene
+    level : str
+    limit : int
+        Grains met after which a path is given up.
 
     Raises
     ------
@@ -227,7 +234,7 @@ def build(scene: Scene, level: str) -> World:
     tables = [table_of(grain) for medium in scene.media for grain in medium.grains]
     made = place(scene, grains=traits.placed)
     notes = list(made.notes)
-    media, absorption, parameters = _media(scene, traits, tables)
+    media, absorption, parameters = _media(scene, traits, tables, limit)
     if records := LEVELS[level].records:
         for grain, table in zip((g for m in scene.media for g in m.grains), tables, strict=True):
             if not getattr(table, records.block):
@@ -243,7 +250,7 @@ def build(scene: Scene, level: str) -> World:
                 f"{scene.name}: [[medium]] {number} ({medium.name}): a grain of diameter {2.0 * medium.radius:g} does "
                 f"not fit into the medium, which is {extent:.3g} thin"
             )
-    notes += _long_paths(scene, traits, tables, made, parameters)
+    notes += _long_paths(scene, traits, tables, made, parameters, limit)
     lights, said = _lights(scene)
     notes += said
     if traits.packed and scene.media and lights.sampled:
@@ -323,7 +330,7 @@ def mean_chord(medium: MediumSpec, boundary: Triangles | None) -> float:
 
 
 def _long_paths(
-    scene: Scene, traits: Traits, tables: list[Table], place: Place, parameters: Sequence[VolumeParameters]
+    scene: Scene, traits: Traits, tables: list[Table], place: Place, parameters: Sequence[VolumeParameters], limit: int
 ) -> list[str]:
     """Return what is to be said of media in which paths meet very many grains; SceneError where they hardly end."""
     notes, at = [], 0
@@ -341,7 +348,7 @@ def _long_paths(
             table.albedo(_least(grain.absorption, scene.metres_per_unit) * medium.radius) / max(table.albedo(), DARKEST)
             for grain, table in own
         )
-        events = min(events, 1.0 / max(1.0 - kept, DARKEST))  # absorption ends paths
+        events = min(events, 1.0 / max(1.0 - kept, DARKEST), limit)  # absorption ends paths
         where = f"{scene.name}: [[medium]] {m + 1} ({medium.name}): light meets about {events:.1g} grains in the mean"
         if not events <= ENDLESS:
             raise SceneError(
@@ -412,7 +419,9 @@ def _spectra(spec: AbsorptionSpec, metres_per_unit: float | None) -> tuple[np.nd
     return absorption_at(spec, image.spectral_weights().wavelength_nm, metres_per_unit), np.zeros(3)
 
 
-def _media(scene: Scene, traits: Traits, tables: list[Table]) -> tuple[Media, Absorption, tuple[VolumeParameters, ...]]:
+def _media(
+    scene: Scene, traits: Traits, tables: list[Table], limit: int
+) -> tuple[Media, Absorption, tuple[VolumeParameters, ...]]:
     """Return media, absorption and volume parameters, with amounts only for what absorbs."""
     specs = [(medium, grain) for medium in scene.media for grain in medium.grains]
     spectra = [_spectra(grain.absorption, scene.metres_per_unit) for _, grain in specs]
@@ -486,7 +495,7 @@ def _media(scene: Scene, traits: Traits, tables: list[Table]) -> tuple[Media, Ab
         scale=np.array(scale),
         slot=np.array(slots, np.int64),
         g=np.array(g),
-        limit=MAX_EVENTS,
+        limit=limit,
     )
     absorption = Absorption(
         spectral=np.ascontiguousarray(spectral), rgb=np.ascontiguousarray(rgb), weight=np.ascontiguousarray(weight),
