@@ -15,6 +15,7 @@ from tsdf.errors import TSDFError, UsageError
 from tsdf.materials import MATERIALS, Medium, OpticalConstants, optical_constants, table_k, table_n
 
 LARGEST = 4_000_000  # bytes of a file; the largest of refractiveindex.info has 2e6
+INDEX = (1e-30, 1e30)  # that a table may have (schema/SPEC.md), as `optics.ETA`; and k at most
 NM = {"nm": 1.0, "um": 1e3, "µm": 1e3, "μm": 1e3, "m": 1e9}  # [nm]
 YAML = (".yml", ".yaml")
 WAY_OUT = "give lines of wavelength_nm,n,k under a header that says so (.csv), or a .yml of refractiveindex.info"
@@ -40,10 +41,12 @@ def constants_of(material: str, wavelength_nm: float) -> OpticalConstants:
     if not shortest <= wavelength_nm <= longest:
         raise UsageError(f"{path}: the wavelength must be {shortest:g} to {longest:g} nm, not {wavelength_nm:.10g}")
     n = medium.n(wavelength_nm)
-    if not 0.0 < n < math.inf:
-        raise TSDFError(f"{path}: n is {n:g} at {wavelength_nm:g} nm; it must be above 0")
+    if not INDEX[0] <= n <= INDEX[1]:
+        raise TSDFError(f"{path}: n is {n:g} at {wavelength_nm:g} nm; it must be above 0, {INDEX[0]:g} to {INDEX[1]:g}")
     known = medium.k is not None and k_range_nm[0] <= wavelength_nm <= k_range_nm[1]
     k = medium.k(wavelength_nm) if medium.k is not None and known else None
+    if k is not None and not 0.0 <= k <= INDEX[1]:
+        raise TSDFError(f"{path}: k is {k:g} at {wavelength_nm:g} nm; it must be 0 to {INDEX[1]:g}")
     return OpticalConstants(n, k, float(wavelength_nm), _line(path.name), medium.source)
 
 
@@ -120,19 +123,26 @@ def _csv(text: str) -> tuple[Span, Span | None, str]:
     def fields(line: str) -> list[str]:
         if separator == " ":
             return line.split()
-        return [field.strip() for field in next(csv.reader([line], delimiter=separator))]
+        try:
+            return [field.strip() for field in next(csv.reader([line], delimiter=separator))]
+        except csv.Error:  # a field of more than 131,072 letters
+            return []
 
-    header = [name.lower() for name in fields(lines[0][1])]
+    header = [name.lower() for name in fields(lines[0][1])] or [""]
     found = re.fullmatch(r"(?:wavelength|lambda|wl)?[ _]*[(\[]?(nm|um|µm|μm|m)[)\]]?", header[0])
     if found is None:
         raise ValueError(f"line {lines[0][0]}: {_line(header[0], 40)!r} does not name wavelength and its unit")
     columns = {name: header.index(name) for name in ("n", "k") if name in header}
     if "n" not in columns:
         raise ValueError(f"line {lines[0][0]}: there is no column n")
+    if twice := [name for name in columns if header.count(name) > 1]:
+        raise ValueError(f"line {lines[0][0]}: there are two columns {twice[0]}")
     rows: dict[str, Rows] = {name: [] for name in columns}
     for i, line in lines[1:]:
         numbers = [field.replace(",", ".") if separator != "," else field for field in fields(line)]
         try:
+            if not numbers or any(numbers[len(header) :]):  # decimal commas between commas, say
+                raise ValueError
             wavelength = float(numbers[0]) * NM[found[1]]
             for name, column in columns.items():
                 if column < len(numbers) and numbers[column]:  # k may be given for some wavelengths only
