@@ -132,6 +132,7 @@ def test_a_newer_minor_version_is_a_warning_of_the_structure():
         {"name": "tetrahedron", "eta": 1.31, "cells": 128, "paths": 1 << 12},
         {"name": "snow", "eta": 1.31, "paths": 1 << 13},
         {"name": "cube", "eta": 1.0},
+        {"name": "cube", "eta": 1.0000001},
         {"memory": 8},
         {"memory": 1, "fresnel": "sp"},
         {"memory": 8, "eta": 0.75},

@@ -367,7 +367,8 @@ def _stated_errors(gavel: _Judge, t: _Subject) -> None:
         if t.exact:
             gavel.near(code, pointer, what, error, 0.0, 0.0)
             continue
-        if name in scattering and t.eta != 1.0 and t.s[name] != 0.0:  # 0 if light enters nothing: a mirror
+        certain = t.s[name] == 0.0 or (name == "mean_cosine" and t.s[name] == 1.0)  # a mirror; almost no boundary
+        if name in scattering and t.eta != 1.0 and not certain:
             gavel.require(error > 0.0, code, pointer, f"{what} is 0 in a traced table")
         if name in width and met > 0.0:
             # no variance of a bounded quantity is larger than (range / 2)^2; 1.5 for the error of the error
