@@ -232,7 +232,7 @@ def main(
     effort = scatterometer.Effort(paths, target_error, cells, joint, seed, max_bounces, memory)
     part_file = out if part is not None else out.with_name(out.name + ".part")
     inputs = [Path(grain), *([Path(material)] if material else [])]
-    check_output(out, *inputs, beside=[] if exact or part is not None else [part_file])
+    check_output(out, *inputs, beside=[] if exact or part is not None else [part_file], part=part is not None)
     if not exact and part_file.exists() and not resume:
         if part is not None:
             raise TSDFError(f"{part_file} exists already: add --resume to go on with it, or choose another --out")
@@ -281,22 +281,23 @@ def main(
             f"{error}; its {build.paths} paths are kept in {plain(part_file)}: --resume goes on with them, "
             "--resume --max-seconds 0 makes the table as good as it got"
         ) from None
+    short = build.falls_short(part or (1, 1))
     if table is not None:
-        finish(table, out, quiet)
+        finish(table, out, quiet, None if short else part_file)
     elif part is not None and not quiet:
         say(f"{plain(out)}: part {part[0]} of {part[1]}, {build.paths} paths; tsdf-merge makes the table")
-    if short := build.falls_short(part or (1, 1)):
+    if short:
         click.echo(f"note: {short}; {plain(part_file)} is kept: --resume goes on", err=True)
-    elif part is None:
-        part_file.unlink(missing_ok=True)
     return 0
 
 
-def finish(table: "Table", out: Path, quiet: bool) -> None:
-    """Write a finished table and sum it up on standard output."""
+def finish(table: "Table", out: Path, quiet: bool, part_file: Path | None = None) -> None:
+    """Write a finished table, remove its part file, and sum it up on standard output, which may be closed or full."""
     from tsdf.format import write
 
     write(table, out)
+    if part_file is not None:
+        part_file.unlink(missing_ok=True)
     ledger = table.header["energy_ledger"]
     leak = (ledger["lost"] + ledger["truncated"]) / ledger["launched"]
     if leak > 1e-6:

@@ -103,7 +103,7 @@ class Tool(click.Command):
 # --- outputs ------------------------------------------------------------------------
 
 
-def check_output(out: Path, *inputs: Path, beside: Iterable[Path] = ()) -> None:
+def check_output(out: Path, *inputs: Path, beside: Iterable[Path] = (), part: bool = False) -> None:
     """Refuse an output that cannot be written, or would replace an input, before any work is done for it.
 
     Parameters
@@ -114,12 +114,14 @@ def check_output(out: Path, *inputs: Path, beside: Iterable[Path] = ()) -> None:
         All that is read. However they are spelled and linked, they are left alone.
     beside : paths
         What is written beside `out`.
+    part : bool
+        Whether `out` is a part file; no other output replaces one, which holds the paths of an unfinished build.
 
     Raises
     ------
     TSDFError
     """
-    from tsdf import files
+    from tsdf import archive, files
 
     read = [source for path in inputs for source in files.sources(Path(path))]
     written: list[Path] = []
@@ -131,6 +133,11 @@ def check_output(out: Path, *inputs: Path, beside: Iterable[Path] = ()) -> None:
             raise UsageError(f"cannot write {shown}: it is an input; choose another --out")
         if any(_same(path, other) for other in written):
             raise UsageError(f"cannot write {shown}: another output is the same file; choose another --out")
+        if path == out and not part and archive.is_part(path):
+            raise TSDFError(
+                f"cannot write {shown}: it holds paths of an unfinished build, which tsdf-merge takes, or --resume "
+                "with the --out of that build; choose another --out, or delete it"
+            )
         written.append(path)
         folder = Path(os.path.realpath(path)).parent
         if not folder.is_dir():

@@ -1,5 +1,7 @@
 """``tsdf-build`` and ``tsdf-merge`` as a user meets them: what they print, refuse and leave behind."""
 
+import errno
+import importlib
 import os
 import re
 import resource
@@ -317,6 +319,39 @@ def test_refused_builds_leave_nothing_in_the_way(tmp_path: Path) -> None:
     result = run("icosphere", "--eta", "1.5", "--paths", "20000", "--max-bounces", "2", "--quiet", "--out", out)
     assert result.exit_code == 1 and "raise --max-bounces" in one_line(result)
     assert not list(tmp_path.iterdir())
+
+
+def test_part_files_are_not_replaced(tmp_path: Path) -> None:
+    """Whoever gives a part file as --out, to --resume perhaps, loses no paths, whatever the command."""
+    from tsdf.cli.plot import main as plot
+
+    part, other = tmp_path / "t.exr.part", tmp_path / "other.part"
+    for i, path in enumerate((part, other), 1):
+        assert run("cube", *FAST, "--chunk", f"{i}/2", "--out", path).exit_code == 0
+    picture, table = tmp_path / "p.png", tmp_path / "t.exr"
+    picture.hardlink_to(other)
+    kept = part.read_bytes(), other.read_bytes()
+    results = [run("cube", *FAST, "--resume", "--out", part), run("sphere", "--out", part)]
+    results.append(CliRunner().invoke(merge, [str(other), "--out", str(part)]))
+    assert run("sphere", "--out", table).exit_code == 0
+    results.append(CliRunner().invoke(plot, [str(table), "--out", str(picture)]))
+    for result in results:
+        assert result.exit_code == 1 and "holds paths of an unfinished build" in one_line(result)
+    assert (part.read_bytes(), other.read_bytes()) == kept
+    assert run("cube", *FAST, "--chunk", "1/2", "--resume", "--out", part).exit_code == 0
+    assert run("cube", *FAST, "--resume", "--out", table).exit_code == 0 and not part.exists()
+
+
+def test_a_full_standard_output_leaves_no_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The table is written, so nothing is unfinished, whoever reads of it."""
+    monkeypatch.setattr(importlib.import_module("tsdf.cli.build"), "say", full)
+    result = run("cube", *FAST[:-1], "--out", tmp_path / "c.exr")
+    assert result.exit_code == 1 and one_line(result).endswith("No space left on device\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["c.exr"]
+
+
+def full(_: str) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def test_an_unfinished_target_is_no_table(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from tsdf.files import replacing
 
 DIGEST = "sha256"  # the member that holds it
+PART = "request"  # the first member of the part file of a build
 
 
 def _digest(arrays: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -74,6 +75,18 @@ def read(path: str | os.PathLike[str], limit: int) -> dict[str, np.ndarray]:
     if digest is None or not np.array_equal(digest, _digest(arrays)):
         raise ValueError("the digest is not that of the arrays")
     return arrays
+
+
+def is_part(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file begins as the part file of a build does, whole or not."""
+    try:
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            return False
+        with open(path, "rb") as file:
+            head = file.read(30 + len(PART) + 4)
+    except OSError:
+        return False
+    return head[:4] == b"PK\x03\x04" and head[30:] == f"{PART}.npy".encode()
 
 
 def _array(data: bytes) -> np.ndarray:

@@ -578,7 +578,7 @@ class Build:
             return f"{paths} of {paths + missing} paths are done"
         error = self.error() if target is not None else None
         if error is not None and target is not None and error.total_variation > target:
-            return f"the target error {target:g} is not met after {paths} paths, {error.total_variation:.2g} is"
+            return f"the target error {target:g} is not met after {paths} paths, {error.total_variation:.3g} is"
         return None
 
     def table(self, as_it_got: bool = False) -> Table:
@@ -626,7 +626,7 @@ class Build:
         """
         request = json.dumps({**self.origin, "effort": asdict(self.effort), "judgement": self.judgement})
         kept: dict[str, np.ndarray] = {
-            "request": np.frombuffer(request.encode(), dtype=np.uint8),
+            archive.PART: np.frombuffer(request.encode(), dtype=np.uint8),
             "done": np.array(self.done, dtype=np.int64).reshape(-1, 2),
             "records_kept": np.array([self.tally.joint, self.tally.memory], dtype=np.int64),
         }
@@ -643,7 +643,7 @@ class Build:
         """
         try:
             arrays = archive.read(path, PART_LIMIT)
-            request = json.loads(arrays.pop("request").tobytes())
+            request = json.loads(arrays.pop(archive.PART).tobytes())
             if (request["part_version"], request["software"]) != (PART_VERSION, estimate.software()):
                 made = printable(str(request["software"]))[:100]
                 raise TSDFError(f"{path}: made by another version ({made}): build it again")
