@@ -52,7 +52,7 @@ def test_what_killed_processes_leave(tmp_path: Path, monkeypatch: pytest.MonkeyP
         write(path)
         assert left.exists() and busy.exists()  # young files are left alone
         for old in (left, busy, *others):
-            os.utime(old, times=(time.time() - 3600,) * 2)
+            os.utime(old, times=(time.time() - 10.0,) * 2)
         write(path)
         assert not left.exists() and busy.exists() and all(other.exists() for other in others)
     finally:

@@ -24,7 +24,7 @@ try:
 except ImportError:  # a system without such locks leaves what killed processes left
     flock = None  # type: ignore[assignment]
 
-STALE_S = 60.0  # [s] younger temporary files are left alone: their lock may be about to be taken
+STALE_S = 5.0  # [s] younger temporary files are left alone: their lock may be about to be taken
 PROBE = bytes(65536)  # what a disk must have room for before any work is done
 MOST_TEXT = 1 << 26  # [bytes] of a mesh that are looked at for names of other files
 _NAMES = {  # how they name them; of a line of materials the last word is one
