@@ -410,6 +410,9 @@ def thin(cells: int, k: int) -> Law:
     return Law(gap / gap.mean(), _even(entry), math.pi * azimuth)
 
 
+MOST_SPHERES = 10**6  # of a packing; that many are more than any table needs
+
+
 def tabulate(
     fractions: Sequence[float] = FRACTIONS,
     packings: int = 4,
@@ -450,6 +453,7 @@ def tabulate(
     for name, value, low, high in (
         ("packings", packings, 2, 64),
         ("lines", lines, 1, 10**6),
+        ("spheres", spheres, 64, MOST_SPHERES),
         ("cells", cells, 2, 1024),
         ("records", k, 2, 4096),
         ("seed", seed, 0, 2**63 - 65),
