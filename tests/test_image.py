@@ -12,6 +12,7 @@ import OpenEXR
 import PIL.Image
 import pytest
 
+from tsdf import image
 from tsdf.errors import TSDFError, UsageError
 from tsdf.image import read_environment, read_exr, spectral_weights, write_exr, write_png
 from tsdf.materials import optical_constants
@@ -388,8 +389,39 @@ def test_small_files_of_many_pixels_are_refused_before_they_are_read(tmp_path):
     """A black image of 8192 x 4096 pixels is a small file that would take gigabytes as an environment."""
     path = written(tmp_path / "sky.exr", dict.fromkeys("RGB", np.zeros((4096, 8192), np.float16)))
     assert path.stat().st_size < 1e6
-    with pytest.raises(TSDFError, match=r"8192 x 4096 pixels.*shrink it"):
+    with pytest.raises(TSDFError, match=r"8192 x 4096 pixels.*1e\+08 numbers.*shrink it"):
         read_environment(path)
+
+
+def test_large_files_may_be_compressed(tmp_path, monkeypatch):
+    """As skies of 8192 x 4096 pixels are; here what is large is made small, and the file padded."""
+    path = written(tmp_path / "sky.exr", dict.fromkeys("RGB", np.ones((64, 128), np.float16)))
+    monkeypatch.setattr(image, "MAX_NUMBERS", 1000)
+    monkeypatch.setattr(image, "SMALL", 4000)
+    path.write_bytes(path.read_bytes().ljust(3999, b"\0"))
+    with pytest.raises(TSDFError, match=r"2.5e[+]04 numbers in all channels, and 4e[+]03 are read"):
+        read_environment(path)
+    path.write_bytes(path.read_bytes().ljust(4000, b"\0"))
+    assert read_environment(path).radiance.shape == (64, 128, 3)
+
+
+def test_a_table_is_no_environment(tmp_path):
+    """It is an OpenEXR image with luminance, and would light a scene."""
+    path = written(tmp_path / "t.exr", {"Y": np.ones((4, 8), np.float32)}, tsdf="{}")
+    with pytest.raises(TSDFError, match=r"a table of grains .*name an environment"):
+        read_environment(path)
+
+
+def test_damage_is_told_in_one_line(tmp_path, capfd):
+    """OpenEXR writes lines of its own to both streams, which stay open."""
+    write_exr(tmp_path / "a.exr", random_image())
+    data = (tmp_path / "a.exr").read_bytes()
+    (tmp_path / "cut.exr").write_bytes(data[:-20])
+    with pytest.raises(TSDFError, match="truncated"):
+        read_exr(tmp_path / "cut.exr")
+    assert capfd.readouterr() == ("", "")
+    os.write(2, b"still open")
+    assert capfd.readouterr().err == "still open"
 
 
 # ------------------------------------------------------------------------------------------------ PNG

@@ -346,7 +346,7 @@ BROKEN = [  # (path, value, what the line says after the name of the scene)
     ("medium/0/grain/0/fraction", 0, MEDIUM + "the fractions of all grains are 0"),
     ("medium/0/grain/0/absorption", -1, GRAIN + ": absorption must be >= 0, not -1"),
     ("medium/0/grain/0/absorption", [1, 2], GRAIN + ": absorption must be a list of 3 numbers, not [1, 2]"),
-    ("medium/0/grain/0/absorption", "ice", GRAIN + ": absorption must be a number, not 'ice'"),
+    ("medium/0/grain/0/absorption", "ice", GRAIN + ": absorption must be numbers or a table, not 'ice'; of a material"),
     ("medium/0/grain/0/absorption", {"material": "ise"}, ", absorption: material cannot be 'ise'; did you mean 'ice'?"),
     ("medium/0/grain/0/absorption", {"material": "salt"}, "cannot be 'salt'; it is one of ice, water, glass"),
     ("medium/0/grain/0/absorption", {"material": "ice", "x": 1}, "absorption: unknown key 'x'; it is one of material"),
@@ -551,5 +551,5 @@ def test_absorption_that_is_not_known():
         absorption_at(replace(spectrum, kind="rgb"), [500.0])
     with pytest.raises(UsageError, match="metres_per_unit"):
         absorption_at(Absorption("spectral", material="ice"), [500.0])
-    with pytest.raises(UsageError, match="350 to 1400 nm"):
+    with pytest.raises(UsageError, match="200 to 4000 nm"):
         absorption_at(Absorption("spectral", material="ice"), [100.0], 1.0)

@@ -87,6 +87,9 @@ def test_grains_too_small_for_their_medium_are_refused(ball):
             SceneError, match=r"heap: \[\[medium\]\] 1 \(heap\): light meets about .*take larger grains"
         ):
             world.build(heap(ball, 1e-12), level)
+    nameless = replace(heap(ball, 1e-12), media=(replace(heap(ball, 1e-12).media[0], name=""),))
+    with pytest.raises(SceneError, match=r"heap: \[\[medium\]\] 1: light meets"):
+        world.build(nameless, "teleport")
     assert not world.build(heap(ball, 1e-12, absorption=1e10), "teleport").notes
     (note,) = world.build(heap(ball, 2e-6), "teleport").notes
     assert "light meets about 5e+05 grains" in note and "s of one thread" in note

@@ -4,11 +4,13 @@ Pixels are linear sRGB (Rec. 709 primaries, white D65), (h, w, 3), row 0 on top.
 beside `format`, to OpenEXR. The directions that the pixels of an environment stand for are in `lights`.
 """
 
+import contextlib
+import io
 import math
 import os
 import stat
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -27,6 +29,9 @@ MAX_EXPOSURE = 128.0  # [stops]
 WAVELENGTHS_NM = tuple(float(nm) for nm in range(385, 780, 10))
 WINDOWS = ("dataWindow", "displayWindow")
 MAX_NUMBERS = 2**25  # of an environment out of a small file: four channels of 4096 x 2048
+SMALL = 10_000_000  # [B] files that must be read within a gigabyte of memory
+DENSEST = 8  # numbers for each byte of a larger file: 8192 x 4096 pixels fit well into 13 MB of lossy compression
+STDERR = 2  # its file descriptor
 LARGEST_HALF = 65504.0  # beyond which 16-bit floats are infinite
 OTHERS = {b"#?": "Radiance HDR", b"\x89PNG": "PNG", b"\xff\xd8\xff": "JPEG", b"II*\0": "TIFF", b"MM\0*": "TIFF"}
 
@@ -144,19 +149,26 @@ def _read(path: str | os.PathLike[str], most: float) -> tuple[Image, Mapping[str
         raise TSDFError(f"{name} is not an OpenEXR file (bytes 0), {way_out}")
     damaged = f"{name}: the file is damaged or truncated, fetch or make it again"
     try:
-        headers = [part.header for part in OpenEXR.File(os.fsdecode(path), header_only=True).parts]
+        with _hushed():
+            headers = [part.header for part in OpenEXR.File(os.fsdecode(path), header_only=True).parts]
         numbers = 0
         for header in headers:  # before the pixels, for OpenEXR allocates whatever a damaged header asks for
             for window in WINDOWS:
                 height, width = _size(header[window])
                 numbers += height * width * (len(header["channels"]) if window == "dataWindow" else 0)
-                if not _readable(height, width) or numbers > most:
+                if not _readable(height, width):
                     raise TSDFError(
                         f"{name}: {width} x {height} pixels ({window}) are not an image this reads; shrink it"
                     )
+                if numbers > most:
+                    raise TSDFError(
+                        f"{name}: {width} x {height} pixels ({window}) are {numbers:.2g} numbers in all channels, and "
+                        f"{most:.2g} are read out of a file of its size; shrink it, or leave out other channels"
+                    )
         if headers and all("deep" in str(header["type"]) for header in headers):
             raise TSDFError(f"{name}: its pixels are deep (several samples each), not an image; flatten it")
-        parts = OpenEXR.File(os.fsdecode(path), separate_channels=True).parts
+        with _hushed():
+            parts = OpenEXR.File(os.fsdecode(path), separate_channels=True).parts
     except (RuntimeError, ValueError, TypeError, KeyError, IndexError, MemoryError) as error:
         raise TSDFError(f"{damaged} ({_one_line(error)})") from error
     # OpenEXR leaves out the parts it cannot read, and only prints so
@@ -175,6 +187,25 @@ def _read(path: str | os.PathLike[str], most: float) -> tuple[Image, Mapping[str
                 texts = {key: value for key, value in header.items() if isinstance(value, str)}
                 return Image(np.stack(rgb, axis=-1), np.stack(variance, axis=-1) if variance else None, texts), header
     raise TSDFError(f"{name}: {_why_no_colour(flat)}; save it as an image with channels R, G, B")
+
+
+@contextlib.contextmanager
+def _hushed() -> Iterator[None]:
+    """Keep the lines in which OpenEXR itself tells of damage out of both streams: an error of ours is one line."""
+    try:
+        kept = os.dup(STDERR)
+    except OSError:  # closed on purpose
+        kept = None
+    with contextlib.redirect_stdout(io.StringIO()):  # its Python module prints there, its C library on the other
+        try:
+            if kept is not None:
+                with open(os.devnull, "wb") as nowhere:
+                    os.dup2(nowhere.fileno(), STDERR)
+            yield
+        finally:
+            if kept is not None:
+                os.dup2(kept, STDERR)
+                os.close(kept)
 
 
 def _layers(name: str, parts: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> list[str]:
@@ -223,15 +254,18 @@ def read_environment(path: str | os.PathLike[str]) -> Environment:
     Raises
     ------
     TSDFError
-        As `read_exr`; also if it is a cube map by its attribute ``envmap``, if all pixels are black, and for an image
-        of more than 2^25 numbers, and more numbers than the file has bytes.
+        As `read_exr`; also if it is a cube map by its attribute ``envmap`` or a table of grains, if all pixels are
+        black, and for an image of more than 2^25 numbers, and more numbers than the file has bytes (eight times as many
+        from 10 MB on).
     """
     name = os.fspath(path)
     try:
         size = os.path.getsize(path)
     except (OSError, ValueError):
         size = 0  # `_read` says why
-    picture, header = _read(path, max(MAX_NUMBERS, size))
+    picture, header = _read(path, max(MAX_NUMBERS, DENSEST * size if size >= SMALL else size))
+    if "tsdf" in header:
+        raise TSDFError(f"{name}: a table of grains (TSDF) and no picture; name an environment")
     if "CUBE" in str(header.get("envmap")):
         raise TSDFError(f"{name}: a cube map by its attribute envmap; convert it to latitude-longitude (exrenvmap)")
     rgb = picture.rgb.astype(np.float64)

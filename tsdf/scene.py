@@ -265,6 +265,11 @@ def parse(data: Mapping[str, Any], folder: str | os.PathLike[str] = ".", name: s
     return replace(_SCENE(data, "the scene", _Place(name, "", Path(folder))), name=name)
 
 
+def called(table: str, number: int, label: str) -> str:
+    """Return what messages call one of an array of tables: its number, from 1, and its name or type if it has one."""
+    return f"[[{table}]] {number}" + (f" ({label})" if label else "")
+
+
 def files_of(scene: Scene) -> tuple[Path, ...]:
     """Return all files that a scene names: tables, meshes and environments."""
 
@@ -522,6 +527,8 @@ def _absorption(value: Any, key: str, at: _Place) -> Absorption:
     element = _number(0.0)
     if isinstance(value, list | tuple):
         return Absorption("rgb", _triple(value, key, at, element))
+    if isinstance(value, str):
+        at.fail(f'{key} must be numbers or a table, not {_shown(value)}; of a material it is {{ material = "ice" }}')
     if not isinstance(value, Mapping):
         return Absorption("grey", (element(value, key, at),))
     at = at.inside(key)

@@ -39,6 +39,7 @@ from tsdf.scene import (
     Slab,
     SunLight,
     absorption_at,
+    called,
 )
 from tsdf.table import Table
 from tsdf.transport import Camera
@@ -247,8 +248,8 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
         extent = _extent(medium, boundary.vertices if boundary is not None else None)
         if 2.0 * medium.radius > extent and medium.inside == "grains":
             notes.append(
-                f"{scene.name}: [[medium]] {number} ({medium.name}): a grain of diameter {2.0 * medium.radius:g} does "
-                f"not fit into the medium, which is {extent:.3g} thin"
+                f"{scene.name}: {called('medium', number, medium.name)}: a grain of diameter {2.0 * medium.radius:g} "
+                f"does not fit into the medium, which is {extent:.3g} thin"
             )
     notes += _long_paths(scene, traits, tables, made, parameters, limit)
     lights, said = _lights(scene)
@@ -286,7 +287,7 @@ def _memory(scene: Scene, tables: list[Table]) -> Memory:
         try:
             laws.append(law(medium.packing_fraction))
         except TSDFError as error:
-            raise SceneError(f"{scene.name}: [[medium]] {number} ({medium.name}): {error}") from None
+            raise SceneError(f"{scene.name}: {called('medium', number, medium.name)}: {error}") from None
         grains.append([(table, grain.fraction) for grain, table in zip(medium.grains, own, strict=True)])
     fractions = [medium.packing_fraction for medium in scene.media]
     return memory_of(laws, fractions, [medium.radius for medium in scene.media], grains)
@@ -349,7 +350,8 @@ def _long_paths(
             for grain, table in own
         )
         events = min(events, 1.0 / max(1.0 - kept, DARKEST), limit)  # absorption ends paths
-        where = f"{scene.name}: [[medium]] {m + 1} ({medium.name}): light meets about {events:.1g} grains in the mean"
+        title = called("medium", m + 1, medium.name)
+        where = f"{scene.name}: {title}: light meets about {events:.1g} grains in the mean"
         if not events <= ENDLESS:
             raise SceneError(
                 f"{where} on its way through, which would take minutes a path; take larger grains, a smaller medium or "
