@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from tsdf import exemplars
+from tsdf import exemplars, surface
 from tsdf.errors import GrainError, UsageError
 from tsdf.grains import (
     BUILT_INS,
@@ -20,6 +20,7 @@ from tsdf.grains import (
     load_grain,
     self_intersection_share,
 )
+from tsdf.surface import ODDLY, _winding_numbers
 
 
 def mesh(name="cube", **given):
@@ -752,3 +753,45 @@ def test_repair_drops_sheets_and_gives_up_on_nonsense():
     assert grain.mesh_hash == load_grain("cube").mesh_hash and any("dropped 1 shell" in n for n in grain.notes)
     refused("50 % of the surface, more than a tenth.*--repair-any", *sheet, repair=True)
     refused("no volume", *sheet, repair="any")
+
+
+def wound(corners, point):
+    """How often triangles wind about a point: the signed solid angles over 4 pi (Van Oosterom and Strackee 1983)."""
+    a, b, c = (corners - point).swapaxes(0, 1)
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    ab, bc, ca = (np.einsum("ij,ij->i", u, v) for u, v in ((a, b), (b, c), (c, a)))
+    angle = np.arctan2(np.einsum("ij,ij->i", a, np.cross(b, c)), la * lb * lc + ab * lc + bc * la + ca * lb)
+    return angle.sum() / (2 * np.pi)
+
+
+def test_winding_numbers():
+    """Crossings of rays wind about points as solid angles do: nested and turned shells, needles, one cell and many."""
+    rng = np.random.default_rng(4)
+    ball = mesh("icosphere", subdivisions=3)
+    needle = (ball[0] * [3.0, 0.01, 0.02], ball[1])
+    for parts in ((ball,), (ball, moved(ball, 0.5), flipped(moved(ball, 0.7))), (needle, moved(ball, 0.3)), (mesh(),)):
+        points, faces = joined(*parts)
+        corners = points[faces] @ ODDLY.T
+        probes = rng.uniform(corners.min(axis=(0, 1)) - 0.1, corners.max(axis=(0, 1)) + 0.1, (200, 3))
+        found, effort = _winding_numbers(corners, probes, 10**9)
+        assert found.tolist() == [round(wound(corners, p)) for p in probes] and len(set(found.tolist())) > 1
+        assert _winding_numbers(corners, probes, effort - 1) == (pytest.approx(np.zeros(200)), effort)
+
+
+def test_many_cavities_take_little():
+    """The effort to tell where shells lie grows with the shells and facets, not with their product."""
+    points, faces = mesh("icosphere", subdivisions=5)
+    probes = np.random.default_rng(3).uniform(-0.5, 0.5, (10_000, 3))
+    found, effort = _winding_numbers(points[faces] @ ODDLY.T, probes, 10**9)
+    assert (found == 1).all() and effort < 100 * len(probes)  # of 20,480 facets
+
+
+@pytest.mark.parametrize("limit", ["MOST_NESTED", "MOST_PAIRS"])
+def test_shells_within_shells_are_bounded(limit, monkeypatch):
+    """Forty shells are told apart; of too many in each other's boxes the message says how many."""
+    points, faces = mesh()
+    nested = joined(*[moved((points, faces if k % 2 else faces[:, ::-1]), 1 + k) for k in range(40)])
+    grain = grain_from_mesh(*nested)
+    assert grain.bodies == 20 and "20 cavities" in grain.notes
+    monkeypatch.setattr(surface, limit, 700)
+    refused("40 shells inside the bounding boxes of others", *nested)

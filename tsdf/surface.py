@@ -22,12 +22,18 @@ CONVEX_TOLERANCE = 1e-6  # [R] how far a vertex may stand before a face's plane
 MOST_ROUNDING = 2e-6  # [R] coordinates rounded more coarsely than this cannot be told from a shape
 FEWEST_LEVELS = 8  # of coordinates along an axis that tell a grid from a few chosen values
 FEWEST_CORNERS = 64  # of a mesh whose coordinates are rounded rather than chosen
-MOST_SHELLS = 10_000  # each is compared with each
+MOST_SHELLS = 10_000  # the boxes of each are compared with each
+MOST_NESTED = 200_000  # pairs of shells of which one's box holds the other's
+MOST_PAIRS = 50_000_000  # of points and triangles, to tell which shells are inside which
+PAIRS_AT_ONCE = 200_000  # of them in memory
+MOST_PER_TRIANGLE = 4  # cells of a grid that a triangle covers on average
 SAME_ANGLE = 1e-6  # [rad] faces about an edge that are closer than this lie on each other
 MODELLER = "use a modeller (Blender: Edit Mode, Mesh > Clean Up)"
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+ODDLY = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]  # turns what stands along axes away from them
 
 
 def compact(points: Floats, faces: Ints) -> tuple[Floats, Ints]:
@@ -330,16 +336,56 @@ def _shell_volumes(points: Floats, faces: Ints, shell: Ints) -> Floats:
     return np.bincount(shell, six) / 6
 
 
-def _winding_number(corners: Floats, point: Floats) -> float:
-    """Return how often triangles (m, 3, 3) wind about a point: the sum of signed solid angles over 4 pi [1].
+def _winding_numbers(corners: Floats, points: Floats, most: int) -> tuple[Ints, int]:
+    """Return (k,) how often closed, consistently wound triangles (m, 3, 3) wind about points (k, 3), and the effort.
 
-    [1] A. Van Oosterom and J. Strackee, IEEE Trans. Biomed. Eng. BME-30 (1983) 125, eq. 8.
+    Crossings of the ray from each point along +z, signed by the winding of the triangle. Triangles are looked for in
+    the cells of a grid over x and y, so that the effort, in pairs of a point and a triangle, grows with m + k, not
+    m k; if it would be more than `most`, zeros are returned. The caller turns all by an odd angle, so that no ray
+    meets an edge; the sides of an edge are told apart by the same rounded number from both of its triangles.
     """
-    a, b, c = (corners - point).swapaxes(0, 1)
-    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
-    dot = [np.einsum("ij,ij->i", u, v) for u, v in ((a, b), (b, c), (c, a))]
-    triple = np.einsum("ij,ij->i", a, np.cross(b, c))
-    return float(np.arctan2(triple, la * lb * lc + dot[0] * lc + dot[1] * la + dot[2] * lb).sum()) / (2 * np.pi)
+    low = corners[:, :, :2].min(axis=(0, 1))
+    width = np.maximum(corners[:, :, :2].max(axis=(0, 1)) - low, 1e-300)
+    cells = int(np.sqrt(len(corners))) + 1
+    while True:
+        first, last = (
+            np.clip(((f(corners[:, :, :2], axis=1) - low) / width * cells).astype(np.int64), 0, cells - 1)
+            for f in (np.min, np.max)
+        )
+        span = last - first + 1
+        if span.prod(axis=1).sum() <= MOST_PER_TRIANGLE * len(corners) or cells == 1:
+            break
+        cells = (cells + 1) // 2
+    triangle, nth = _ranges(span.prod(axis=1))
+    cell = (first[triangle, 0] + nth // span[triangle, 1]) * cells + first[triangle, 1] + nth % span[triangle, 1]
+    triangle = triangle[np.argsort(cell, kind="stable")]
+    held = np.bincount(cell, minlength=cells**2)
+    begin = np.cumsum(held) - held
+    at = ((points[:, :2] - low) / width * cells).astype(np.int64)
+    beside = ((at < 0) | (at >= cells)).any(axis=1)
+    at = np.where(beside, 0, at[:, 0] * cells + at[:, 1])
+    found = np.zeros(len(points), np.int64)
+    met = np.where(beside, 0, held[at])
+    pairs = int(met.sum())
+    if pairs > most:
+        return found, pairs
+    for some in np.split(np.arange(len(points)), np.flatnonzero(np.diff(np.cumsum(met) // PAIRS_AT_ONCE)) + 1):
+        point, nth = _ranges(met[some])
+        point = some[point]
+        relative = corners[triangle[begin[at[point]] + nth]] - points[point][:, None]
+        a, b, c = relative.swapaxes(0, 1)
+        weights = np.array([u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] for u, v in ((b, c), (c, a), (a, b))])
+        total = weights.sum(axis=0)
+        above = (weights.T * relative[:, :, 2]).sum(axis=1) * np.sign(total) > 0
+        crossed = ((weights > 0).all(axis=0) | (weights < 0).all(axis=0)) & above
+        np.add.at(found, point[crossed], np.sign(total[crossed]).astype(np.int64))
+    return found, pairs
+
+
+def _ranges(lengths: Ints) -> tuple[Ints, Ints]:
+    """Return for every element of ranges of these lengths the range it is of, and its place in it."""
+    which = np.repeat(np.arange(len(lengths)), lengths)
+    return which, np.arange(len(which)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
 
 
 def outward(points: Floats, faces: Ints, shell: Ints, name: str, place: Any, notes: list[str]) -> tuple[Ints, int]:
@@ -349,16 +395,28 @@ def outward(points: Floats, faces: Ints, shell: Ints, name: str, place: Any, not
         raise GrainError(f"{name}: {fault}; remove small parts")
     order = np.argsort(shell, kind="stable")
     groups = np.split(faces[order], np.cumsum(np.bincount(shell))[:-1])
-    low = np.array([points[g].min(axis=(0, 1)) for g in groups])
-    high = np.array([points[g].max(axis=(0, 1)) for g in groups])
+    sides = np.array([[*points[g].min(axis=(0, 1)), *-points[g].max(axis=(0, 1))] for g in groups]).T.copy()
     sign = np.sign(_shell_volumes(points, faces, shell))
-    around: list[list[int]] = []  # the shells around each shell
-    for i, group in enumerate(groups):
-        boxes = np.flatnonzero((low <= low[i]).all(axis=1) & (high >= high[i]).all(axis=1))
-        probes = points[group[:: max(1, len(group) // 8)]].mean(axis=1)  # vertices may touch another shell
-        corners = {int(j): points[groups[j]] for j in boxes if j != i}
+    # probes of each shell: not vertices, which may touch another shell
+    probes = [points[group[:: max(1, len(group) // 8)]].mean(axis=1) @ ODDLY.T for group in groups]
+    turned = points @ ODDLY.T
+    around: list[list[int]] = [[] for _ in groups]  # the shells around each shell
+    nested, left = 0, MOST_PAIRS
+    for j, group in enumerate(groups):
+        within = np.flatnonzero((sides >= sides[:, [j]]).all(axis=0))
+        within = within[within != j]
+        if len(within) == 0:
+            continue
+        some = [probes[i] for i in within]
+        wound, pairs = _winding_numbers(turned[group], np.vstack(some), left)
+        nested, left = nested + len(within), left - pairs
+        if nested > MOST_NESTED or left < 0:
+            fault = f"{len(groups)} shells inside the bounding boxes of others, more than can be told apart"
+            raise GrainError(f"{name}: {fault}; remove inner shells")
+        starts = np.cumsum([0] + [len(p) for p in some[:-1]])
         # probes that disagree mean shells that cross; check_crossings finds those
-        around.append([j for j, c in corners.items() if all(abs(_winding_number(c, p)) > 0.5 for p in probes)])
+        for i in within[np.logical_and.reduceat(wound != 0, starts)]:
+            around[i].append(j)
     depth = np.array([len(a) for a in around])
     turn = np.zeros(len(groups), bool)
     for i, outer in enumerate(around):
