@@ -60,6 +60,7 @@ DOORS = {
     "numba": {"compiled", "handle"},
     "DracoPy": {"gltf"},
     "collada": {"meshes"},
+    "trimesh": {"meshes"},
     "mapbox_earcut": {"polygons"},
     "embreex": {"grains"},
     "OpenEXR": {"container", "image"},

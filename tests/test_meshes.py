@@ -138,6 +138,51 @@ def test_ply_of_mixed_polygons(order, tmp_path):
     assert size(loaded(tmp_path, "mixed.ply", ply(CUBE, faces, order))) == pytest.approx((1, 6))
 
 
+@pytest.mark.parametrize("order", ["", "<", ">"])
+@pytest.mark.parametrize(
+    "index", ["uchar int vertex_index", "uint8 uint8 vertex_indices", "ushort double vertex_index"]
+)
+@pytest.mark.parametrize("mixed", [True, False])
+def test_ply_with_further_properties(order, index, mixed, tmp_path):
+    """Lists of any type and length in any element, before and after the indices; what they hold is of no matter."""
+    codes = {"uchar": "B", "uint8": "B", "ushort": "H", "int": "i", "double": "d", "float": "f"}
+    words, rows = [], []
+
+    def row(*fields):
+        words.append(" ".join(f"{value:g}" for _, value in fields))
+        rows.append(b"".join(struct.pack((order or "<") + code, value) for code, value in fields))
+
+    def several(length, kind, values):
+        return (codes[length], len(values)), *((codes[kind], value) for value in values)
+
+    length, kind, _ = index.split()
+    faces = [
+        *CUBE_FACES[:5],
+        *([CUBE_FACES[5][:3], CUBE_FACES[5][2:] + CUBE_FACES[5][:1]] if mixed else CUBE_FACES[5:]),
+    ]
+    row(("f", 35.5), *several("uchar", "double", [0.25]))
+    for k, p in enumerate(CUBE):
+        weights = [0.5] * (k % 3 if mixed else 1)
+        row(*(("f", x) for x in p), ("B", 200), *several("uchar", "float", weights))
+    for k, f in enumerate(faces):
+        before, after = ([0.5] * (k % 2), [0.125] * len(f)) if mixed else ([], [0.125])
+        row(*several("uchar", "double", before), ("f", 0.5), *several(length, kind, f),
+            *several("uchar", "float", after), ("i", -7))  # fmt: skip
+    row(("i", 0), ("i", 1), *several("ushort", "float", [0.5, -0.5]))
+    form = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    head = f"ply\nformat {form} 1.0\ncomment no format ascii 1.0\nelement camera 1\nproperty float f\n"
+    head += "property list uchar double range\nelement vertex 8\nproperty float x\nproperty float y\n"
+    head += "property float z\nproperty uchar red\nproperty list uchar float weights\n"
+    head += f"element face {len(faces)}\nproperty list uchar double before\nproperty float quality\n"
+    head += f"property list {index}\nproperty list uchar float texcoord\nproperty int flags\nelement edge 1\n"
+    head += "property int vertex1\nproperty int vertex2\nproperty list ushort float vertex_indices\nend_header\n"
+    body = b"".join(rows) if order else "\n".join(words).encode()
+    assert size(loaded(tmp_path, "extra.ply", head.encode() + body)) == pytest.approx((1, 6))
+    if kind == "double":
+        wrong = body.replace(*(struct.pack(order + "d", x) if order else f" {x} ".encode() for x in (6, 6.5)), 1)
+        refused("no whole number", tmp_path, "half.ply", head.encode() + wrong)
+
+
 def test_ply_faces_first(tmp_path):
     """Elements in another order, and one of no interest before them."""
     head = "ply\nformat ascii 1.0\nelement camera 1\nproperty float f\nelement face 6\n"
@@ -147,11 +192,36 @@ def test_ply_faces_first(tmp_path):
     assert size(loaded(tmp_path, "first.ply", head + rows)) == pytest.approx((1, 6))
 
 
-def test_stl_names(tmp_path):
-    """A binary file that calls itself solid, and a text whose name holds the word vertex."""
-    assert size(loaded(tmp_path, "solid.stl", b"solid" + FILES["binary.stl"][5:])) == pytest.approx((2, 10))
-    named = FILES["text.stl"].replace(b"solid box\n", b"solid a vertex more\n", 1).replace(b"facet", b"FACET")
-    assert size(loaded(tmp_path, "named.stl", named)) == pytest.approx((2, 10))
+def test_stl_forms(tmp_path):
+    """A binary file that calls itself solid or goes on, texts whose names hold words of the format, many solids."""
+    binary, text = FILES["binary.stl"], FILES["text.stl"]
+    for data in (
+        b"solid" + binary[5:],
+        binary + b"\0\0",
+        text.replace(b"solid box\n", b"solid a vertex more\n", 1).replace(b"facet", b"FACET"),
+        text.replace(b"solid box\n", b"solid the endsolid of \xe9\n", 1),
+        text.replace(b"endsolid", b""),
+        text.replace(b"\n", b"\r"),
+        text.replace(b"facet normal", b"endsolid\nsolid\nfacet normal"),
+    ):
+        assert size(loaded(tmp_path, "box.stl", data)) == pytest.approx((2, 10))
+    two = loaded(tmp_path, "two.stl", text + text.replace(b"vertex ", b"vertex 5"))  # the second moved by 50
+    assert size(two) == pytest.approx((4, 20)) and two.bodies == 2
+
+
+def test_stl_that_is_cut_off(tmp_path):
+    """Never a grain of what is left, whether a facet, a solid or a number is missing."""
+    text = FILES["text.stl"]
+    last = text.rindex(b"vertex")
+    refused("ends within a facet", tmp_path, "facet.stl", text + text[:last])
+    second = text[: text.rindex(b"facet n")].replace(b"vertex ", b"vertex 5")
+    with pytest.raises(GrainError, match="not closed: 3 boundary edges"):
+        loaded(tmp_path, "solid.stl", text + second)
+    refused("cannot be read", tmp_path, "word.stl", text[:last] + b"vertex 1 x 0\n" + text[last:].partition(b"\n")[2])
+    refused("cannot be read", tmp_path, "number.stl", text.replace(b"vertex 2 0 0\n", b"vertex 2 0\n"))
+    refused("announces 12 facets and holds 11", tmp_path, "binary.stl", FILES["binary.stl"][:-1])
+    for name, data in (("empty.stl", b"solid\nendsolid\n"), ("none.stl", bytes(84))):
+        refused("holds no mesh", tmp_path, name, data)
 
 
 def test_ply_strips(tmp_path):
@@ -445,6 +515,43 @@ def test_3mf_refused_by_name(tmp_path):
     refused("needs the extension http://example.org/volumetric", tmp_path, "needs.3mf", fuzz.packed(needs.encode()))
     lost = model.replace('component objectid="1"', 'component objectid="7"')
     refused("object 7 is not there", tmp_path, "lost.3mf", fuzz.packed(lost.encode()))
+
+
+def test_3mf_of_several_models(tmp_path):
+    """Objects of a second model, by their numbers, as often as they are named."""
+    production = 'xmlns:p="http://schemas.microsoft.com/3dmanufacturing/production/2015/06" unit="'
+    parts = fuzz.MODEL.replace('<object id="2"', '<object id="9">' + fuzz.MODEL.partition('type="model">')[2].partition(
+        "<object")[0] + '<object id="2"')  # fmt: skip
+    for first, second in ((1, 9), (1, 1)):
+        components = "".join(
+            f'<component p:path="/3D/Objects/parts.model" objectid="{k}" transform="1 0 0 0 1 0 0 0 1 {x} 0 0"/>'
+            for k, x in ((first, 0), (second, 5))
+        )
+        root = fuzz.MODEL.replace('unit="', production)
+        root = re.sub("<component .*?/>", components, re.sub("<mesh>.*?</mesh>", "", root))
+        out = io.BytesIO()
+        with zipfile.ZipFile(out, "w") as archive:
+            archive.writestr("3D/3dmodel.model", root)
+            archive.writestr("3D/Objects/parts.model", parts)
+        grain = loaded(tmp_path, "parts.3mf", out.getvalue())
+        assert size(grain) == pytest.approx((4, 20)) and grain.bodies == 2
+
+
+def test_dae_scenes(tmp_path):
+    """A node that mirrors, concave polygons, a geometry that is not there."""
+    mirror = loaded(tmp_path, "mirror.dae", fuzz.DAE.replace("<translate>1 0 0</translate>", "<scale>-1 1 1</scale>"))
+    assert size(mirror) == pytest.approx((2, 10)) and mirror.notes == ()
+    for turn in range(6):
+        faces = [np.roll(f, turn).tolist() for f in L_FACES[:2]] + L_FACES[2:]
+        text = re.sub('count="24">.*?<', f'count="36">{" ".join(str(x) for p in L_POINTS for x in p)}<', fuzz.DAE)
+        text = text.replace('count="8" stride', 'count="12" stride').replace(
+            '<polylist count="6"', '<polylist count="8"'
+        )
+        text = text.replace("4 4 4 4 4 4", "6 6 4 4 4 4 4 4")
+        text = re.sub("<p>.*?</p>", f"<p>{' '.join(str(i) for f in faces for i in f)}</p>", text)
+        assert size(loaded(tmp_path, "l.dae", text)) == pytest.approx((3, 14))
+    one = '<instance_geometry url="#g"/>'
+    refused("#lost not found", tmp_path, "lost.dae", fuzz.DAE.replace(one, one + one.replace("#g", "#lost")))
 
 
 def test_dae_without_its_package(tmp_path, monkeypatch):

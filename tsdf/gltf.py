@@ -17,7 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsdf.errors import GrainError
-from tsdf.polygons import MOST_PIECES, Budget, Floats, Ints, Part, fan_triangles, strip_triangles, triangle_part
+from tsdf.polygons import (
+    MOST_PIECES,
+    Budget,
+    Floats,
+    Ints,
+    Part,
+    fan_triangles,
+    strip_triangles,
+    triangle_part,
+    turned_over,
+)
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3}
@@ -121,10 +131,9 @@ class _Document:
             if "skin" in node or any(node.get("weights", self._item("meshes", node["mesh"]).get("weights", ()))):
                 raise GrainError(f"node {index} is posed by a skin or morph targets; apply them and export again")
             for part in self._mesh(node["mesh"]):
+                placed = part._replace(points=part.points @ matrix[:3, :3].T + matrix[:3, 3])
                 mirrored = np.linalg.det(matrix[:3, :3]) < 0
-                corners = part.corners.reshape(-1, 3)[:, ::-1].reshape(-1) if mirrored else part.corners
-                placed = part.points @ matrix[:3, :3].T + matrix[:3, 3]
-                found.append(budget.spend(Part(placed, corners, part.sizes)))
+                found.append(budget.spend(turned_over(placed) if mirrored else placed))
         return found, self.size
 
     def _mesh(self, index: int) -> list[Part]:

@@ -2,12 +2,14 @@
 
 Only the file types in `READERS` are opened, only regular files, and no file beside the one named but the buffers that
 a .gltf lists in its own folder. Whatever a file announces is compared with what it holds before room is made for it: a
-file below 10 MB takes less than 1 GB and 20 seconds, or is refused. OBJ, OFF, PLY, STL and 3MF are read here, DAE
-through pycollada; glTF is `gltf`, VTK is `vtk`, polygons become triangles in `polygons`.
+file below 10 MB takes less than 1 GB and 20 seconds, or is refused. STL is read through trimesh. Others are not, for it
+fans concave polygons (OBJ, OFF, PLY, DAE), leaves out what it cannot find (DAE, 3MF) and takes each object of a second
+model of a 3MF for all of them. DAE is read through pycollada, glTF by `gltf`, VTK by `vtk`, the rest here.
 Nothing is checked here, nor merged but the equal corners of an STL: what makes a closed surface of it is `surface`.
 """
 
 import io
+import logging
 import re
 import stat
 import warnings
@@ -23,7 +25,18 @@ from numpy.typing import NDArray
 
 from tsdf.errors import GrainError
 from tsdf.gltf import read_gltf
-from tsdf.polygons import MOST_PIECES, Budget, Floats, Ints, Part, strips_part, triangle_part, triangles_of
+from tsdf.polygons import (
+    MOST_PIECES,
+    Budget,
+    Floats,
+    Ints,
+    Part,
+    strips_part,
+    triangle_part,
+    triangles_of,
+    turned_over,
+    whole,
+)
 from tsdf.surface import equal_vertices
 from tsdf.vtk import numbers, read_vtk
 
@@ -174,7 +187,7 @@ def _read_off(data: bytes) -> list[Part]:
 PLY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
-    "float32": "f4", "float64": "f8",
+    "float32": "f4", "float64": "f8", "int64": "i8", "uint64": "u8",
 }
 # fmt: on
 
@@ -193,7 +206,7 @@ def _read_ply(data: bytes) -> list[Part]:
     if not data.startswith(b"ply") or end is None:
         raise ValueError("no PLY header")
     header, body = data[: end.start()], data[end.end() :]
-    order = ""
+    order: str | None = None
     elements: list[tuple[str, int, list[Column]]] = []
     for line in header.decode("ascii", errors="replace").splitlines():
         match line.split():
@@ -205,7 +218,9 @@ def _read_ply(data: bytes) -> list[Part]:
                 elements[-1][2].append(Column(name, PLY_TYPES[kind], PLY_TYPES[length]))
             case ["property", kind, name]:
                 elements[-1][2].append(Column(name, PLY_TYPES[kind]))
-    text = numbers(body) if b"format ascii" in header else None
+    if order is None:
+        raise ValueError("no format in its header")
+    text = None if order else numbers(body)
     places, at = np.empty((0, 3)), 0
     faces: list[tuple[bool, Ints, Ints]] = []
     for name, rows, columns in elements:
@@ -222,9 +237,9 @@ def _read_ply(data: bytes) -> list[Part]:
             values, at = _text_rows(text, at, rows, columns)
         if name == "vertex":
             places = np.column_stack([values[axis] for axis in "xyz"]).astype(np.float64)
-        for key in ("vertex_indices", "vertex_index"):
-            if name in ("face", "tristrips") and key in values:
-                faces.append((name == "tristrips", _whole(values[key][0]), values[key][1]))
+        key = next((c.name for c in columns if c.length and c.name in ("vertex_indices", "vertex_index")), None)
+        if name in ("face", "tristrips") and key is not None:
+            faces.append((name == "tristrips", whole(values[key][0]), values[key][1]))
     parts = [
         _strips(places, corners, sizes) if strips else Part(places, corners, sizes) for strips, corners, sizes in faces
     ]
@@ -244,12 +259,12 @@ def _binary_rows(body: bytes, at: int, count: int, columns: list[Column], order:
 
     def alike(lengths: list[int]) -> np.dtype:
         """The type of a row whose lists have these lengths."""
-        fields: list[tuple[str, str] | tuple[str, str, int]] = []
+        fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
         left = iter(lengths)
         for k, column in enumerate(columns):
             if column.length:
                 fields.append((f"length{k}", order + column.length))
-                fields.append((f"value{k}", order + column.kind, next(left)))
+                fields.append((f"value{k}", order + column.kind, (next(left),)))
             else:
                 fields.append((f"value{k}", order + column.kind))
         return np.dtype(fields)
@@ -286,9 +301,7 @@ def _binary_rows(body: bytes, at: int, count: int, columns: list[Column], order:
         if all((table[f"length{k}"] == row[f"value{k}"].shape[0]).all() for k in lists):  # all rows like the first
             for k, column in enumerate(columns):
                 value = table[f"value{k}"]
-                values[column.name] = (
-                    (_whole(value.ravel()), np.full(count, value.shape[1])) if column.length else value
-                )
+                values[column.name] = (value.reshape(-1), np.full(count, value.shape[1])) if column.length else value
             return values, at + count * row.itemsize
     starts, lengths = [], []
     for _ in range(count):
@@ -337,33 +350,38 @@ def _text_rows(text: Floats, at: int, count: int, columns: list[Column]) -> tupl
     }, at + i
 
 
-def _whole(values: NDArray) -> Ints:
-    """Return indices as int64."""
-    if values.dtype.kind == "f" and not (np.abs(values) < 2**53).all():
-        raise ValueError("an index that is no whole number")
-    whole = values.astype(np.int64)
-    if (whole != values).any():
-        raise ValueError("an index that is no whole number")
-    return whole
-
-
 # ---------------------------------------------------------------------------------------------------- STL
 
-STL_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+VERTEX = re.compile(rb"^\s*vertex\s+\S+\s+\S+\s+\S+", re.MULTILINE | re.IGNORECASE)
 
 
 def _read_stl(data: bytes) -> list[Part]:
-    """Facets of an STL, equal corners as one vertex; binary if the number it would announce then fits its length."""
+    """Facets of an STL through trimesh, equal corners as one vertex.
+
+    It is binary if the number of facets that it would announce then fits its length. Of a text trimesh sees the vertex
+    lines alone, as one solid: it takes quadratic time in the number of solids (139 s for 20,000), leaves out one that
+    is cut off, and takes words of a name for vertices.
+    """
     count = int.from_bytes(data[80:84], "little")
     if len(data) >= 84 and (len(data) == 84 + 50 * count or data.lstrip()[:5].lower() != b"solid"):
         if 84 + 50 * count > len(data):
             raise ValueError(f"announces {count} facets and holds {max(0, len(data) - 84) // 50}")
-        corners = np.frombuffer(data, STL_FACET, count, 84)["corners"].reshape(-1, 3).astype(np.float64)
+        data = data[: 84 + 50 * count]
     else:
-        words = re.findall(rb"^\s*vertex\s+(\S+)\s+(\S+)\s+(\S+)", data, re.MULTILINE | re.IGNORECASE)
-        corners = np.array(words, np.float64).reshape(-1, 3)
-        if len(corners) % 3:
+        lines = VERTEX.findall(data.replace(b"\r", b"\n"))
+        if len(lines) % 3:
             raise ValueError("ends within a facet")
+        count = len(lines) // 3
+        data = b"solid\n" + b"\n".join(b" ".join(line.split()) for line in lines) + b"\nendsolid\n"
+    if count == 0:
+        return []
+    logging.getLogger("trimesh").setLevel(logging.CRITICAL)
+    import trimesh
+
+    mesh = trimesh.load_mesh(io.BytesIO(data), file_type="stl", process=False)
+    corners = np.asarray(mesh.triangles, np.float64).reshape(-1, 3)
+    if len(corners) != 3 * count:
+        raise ValueError(f"{count} facets are there, {len(corners) // 3} can be read")
     used, index = np.unique(equal_vertices(corners), return_inverse=True)
     return [triangle_part(corners[used], index.reshape(-1, 3))]
 
@@ -401,8 +419,8 @@ def _read_3mf(data: bytes) -> list[Part]:
             raise ValueError(f"object {index} is not there")
         part, components = objects[file, index]
         if part is not None:
-            turned = part.corners if np.linalg.det(matrix[:3]) > 0 else part.corners.reshape(-1, 3)[:, ::-1].reshape(-1)
-            parts.append(budget.spend(Part(part.points @ matrix[:3] + matrix[3], turned, part.sizes)))
+            placed = part._replace(points=part.points @ matrix[:3] + matrix[3])
+            parts.append(budget.spend(turned_over(placed) if np.linalg.det(matrix[:3]) < 0 else placed))
         budget.take(0)
         if depth > 32 or len(waiting) + len(components) > MOST_PIECES:
             raise GrainError(f"objects within objects more than 32 deep, or more than {MOST_PIECES} of them; {WAY_OUT}")
@@ -494,17 +512,19 @@ def _read_dae(data: bytes) -> list[Part]:
     if document.scene is None:
         return parts
     for shape in document.scene.objects("geometry"):
+        mirrored = np.linalg.det(shape.matrix[:3, :3]) < 0
         for primitive in shape.primitives():
             if getattr(primitive, "vertex", None) is None or primitive.vertex_index is None:
                 continue
             index = np.asarray(primitive.vertex_index, np.int64)
             if hasattr(primitive, "polyindex"):
-                part = Part(primitive.vertex, index.reshape(-1), np.diff(primitive.polyindex)[:, 0].astype(np.int64))
+                sizes = np.diff(primitive.polyindex)[:, 0].astype(np.int64)
+                part = Part(primitive.vertex, index.reshape(-1), sizes)
             elif index.ndim == 2 and index.shape[1] == 3:
                 part = triangle_part(primitive.vertex, index)
             else:
                 continue
-            parts.append(budget.spend(part))
+            parts.append(budget.spend(turned_over(part) if mirrored else part))
     return parts
 
 

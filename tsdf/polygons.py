@@ -67,10 +67,33 @@ class Budget:
             raise GrainError(f"is made of more than {MOST_PIECES} pieces; join them")
 
 
+def whole(values: NDArray) -> Ints:
+    """Return indices as int64.
+
+    Raises
+    ------
+    ValueError
+        One of them is no whole number.
+    """
+    if values.dtype.kind == "f" and not (np.abs(values) < 2**53).all():
+        raise ValueError("an index that is no whole number")
+    indices = values.astype(np.int64)
+    if (indices != values).any():
+        raise ValueError("an index that is no whole number")
+    return indices
+
+
 def triangle_part(points: ArrayLike, triangles: ArrayLike) -> Part:
     """Return the part of triangles, (m, 3) int."""
     faces = np.asarray(triangles, np.int64)
     return Part(np.asarray(points, np.float64), faces.reshape(-1), np.full(len(faces), 3))
+
+
+def turned_over(part: Part) -> Part:
+    """Return the part with each polygon wound the other way, for a placement that mirrors."""
+    last = np.cumsum(part.sizes) - 1
+    order = np.repeat(2 * last - part.sizes + 1, part.sizes) - np.arange(len(part.corners))
+    return part._replace(corners=part.corners[order])
 
 
 def strip_triangles(corners: ArrayLike) -> Ints:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsdf.errors import GrainError
-from tsdf.polygons import Budget, Floats, Ints, Part, strips_part
+from tsdf.polygons import Budget, Floats, Ints, Part, strips_part, whole
 
 MOST_NUMBERS = 9_000_000  # of one array, or one for each byte: a compressed one takes room that its bytes do not show
 # fmt: off
@@ -32,7 +32,6 @@ XML_TYPES = {
     "Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8",
 }
 # fmt: on
-WORD = re.compile(rb"\S+")
 WORD = re.compile(rb"\S+")
 NO_FACE, TRIANGLE, STRIP, POLYGON, PIXEL, QUAD = (1, 2, 3, 4), 5, 6, 7, 8, 9  # cell types
 
@@ -165,7 +164,7 @@ def _legacy(data: bytes) -> list[Part]:
         elif key == "CELL_TYPES":
             if cells is None:
                 raise ValueError("has types of cells and no cells")
-            parts += _part(points, *cells, _index(words.array(int(head[1]), "i4")))
+            parts += _part(points, *cells, whole(words.array(int(head[1]), "i4")))
         elif key == "METADATA":
             while words.line():
                 pass
@@ -188,9 +187,9 @@ def _legacy_cells(words: _Words, count: int, size: int) -> tuple[Ints, Ints]:
             head = words.words()
             if len(head) < 2 or head[0].upper() != name:
                 raise ValueError(f"has no {name} of its cells")
-            arrays.append(_index(words.array(length, LEGACY_TYPES[head[1].lower()])))
+            arrays.append(whole(words.array(length, LEGACY_TYPES[head[1].lower()])))
         return arrays[1], np.diff(arrays[0])
-    values = _index(words.array(size, "i4"))
+    values = whole(words.array(size, "i4"))
     at, starts = 0, []
     listed = values.tolist()
     for _ in range(count):
@@ -203,14 +202,6 @@ def _legacy_cells(words: _Words, count: int, size: int) -> tuple[Ints, Ints]:
     kept = np.ones(len(listed), bool)
     kept[starts] = False
     return values[kept], values[starts]
-
-
-def _index(values: NDArray) -> Ints:
-    """Return indices as int64."""
-    whole = values.astype(np.int64)
-    if (whole != values).any():
-        raise ValueError("an index that is no whole number")
-    return whole
 
 
 # ---------------------------------------------------------------------------------------------------- XML
@@ -242,10 +233,10 @@ def _xml(data: bytes) -> list[Part]:
             if section is None or cells == 0:
                 continue
             named = {node.get("Name"): node for node in section.iter("DataArray")}
-            ends = _index(arrays.of(named["offsets"], cells))
+            ends = whole(arrays.of(named["offsets"], cells))
             sizes = np.diff(ends, prepend=0)
-            corners = _index(arrays.of(named["connectivity"], int(ends[-1])))
-            types = _index(arrays.of(named["types"], cells)) if tag_name == "Cells" else None
+            corners = whole(arrays.of(named["connectivity"], int(ends[-1])))
+            types = whole(arrays.of(named["types"], cells)) if tag_name == "Cells" else None
             parts += _strips(points, corners, sizes) if tag_name == "Strips" else _part(points, corners, sizes, types)
         if not parts:
             parts.append(Part(points, np.empty(0, np.int64), np.empty(0, np.int64)))
