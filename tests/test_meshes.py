@@ -220,7 +220,8 @@ def test_stl_that_is_cut_off(tmp_path):
     refused("cannot be read", tmp_path, "word.stl", text[:last] + b"vertex 1 x 0\n" + text[last:].partition(b"\n")[2])
     refused("cannot be read", tmp_path, "number.stl", text.replace(b"vertex 2 0 0\n", b"vertex 2 0\n"))
     refused("announces 12 facets and holds 11", tmp_path, "binary.stl", FILES["binary.stl"][:-1])
-    for name, data in (("empty.stl", b"solid\nendsolid\n"), ("none.stl", bytes(84))):
+    lines = b"solid\n" + b"\n" * 5_000_000  # would take days if each were a place to begin
+    for name, data in (("empty.stl", b"solid\nendsolid\n"), ("none.stl", bytes(84)), ("lines.stl", lines)):
         refused("holds no mesh", tmp_path, name, data)
 
 

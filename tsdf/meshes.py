@@ -38,7 +38,7 @@ from tsdf.polygons import (
     whole,
 )
 from tsdf.surface import equal_vertices
-from tsdf.vtk import numbers, read_vtk
+from tsdf.vtk import check_xml, numbers, read_vtk
 
 LARGEST_FILE = 2**31  # bytes
 WAY_OUT = "export it again, as OBJ, PLY, STL or GLB"
@@ -352,7 +352,7 @@ def _text_rows(text: Floats, at: int, count: int, columns: list[Column]) -> tupl
 
 # ---------------------------------------------------------------------------------------------------- STL
 
-VERTEX = re.compile(rb"^\s*vertex\s+\S+\s+\S+\s+\S+", re.MULTILINE | re.IGNORECASE)
+VERTEX = re.compile(rb"^[ \t]*vertex\s+\S+\s+\S+\s+\S+", re.MULTILINE | re.IGNORECASE)
 
 
 def _read_stl(data: bytes) -> list[Part]:
@@ -489,12 +489,6 @@ def _read_model(stream: Any, file: str, objects: dict, most: int) -> list[tuple[
     parser.StartNamespaceDeclHandler = lambda prefix, space: spaces.update({prefix: space})
     parser.ParseFile(stream)
     return items
-
-
-def check_xml(data: bytes) -> None:
-    """Refuse XML that declares a document type, for entities grow without bound, or that is not in UTF-8."""
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:
-        raise GrainError(f"its XML declares a document type or is not UTF-8; {WAY_OUT}")
 
 
 def _read_dae(data: bytes) -> list[Part]:

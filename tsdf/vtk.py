@@ -207,6 +207,12 @@ def _legacy_cells(words: _Words, count: int, size: int) -> tuple[Ints, Ints]:
 # ---------------------------------------------------------------------------------------------------- XML
 
 
+def check_xml(data: bytes) -> None:
+    """Refuse XML that declares a document type, for entities grow without bound, or that is not in UTF-8."""
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:
+        raise GrainError("its XML declares a document type or is not UTF-8; save it as .stl or .ply")
+
+
 def _xml(data: bytes) -> list[Part]:
     head, mark, tail = data.partition(b"<AppendedData")
     appended = b""
@@ -216,8 +222,7 @@ def _xml(data: bytes) -> list[Part]:
         if b"base64" in tag:
             appended = appended.partition(b"<")[0]
         data = head + b"</VTKFile>"
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:
-        raise GrainError("its XML declares a document type or is not UTF-8; save it as .stl or .ply")
+    check_xml(data)
     root = ElementTree.fromstring(data)
     if root.tag != "VTKFile" or root.get("type") not in ("PolyData", "UnstructuredGrid"):
         raise GrainError(f"a data set of kind {root.get('type', root.tag)} has no surface; save it as .vtp or .stl")
