@@ -18,6 +18,7 @@ from tsdf.vectors import KERNEL, dot
 
 STEPS = 64  # of a ray through the grid; the ray engine is faster with those that need more
 OUTSIDE = 16  # facets that reach out of the grid, with more of which rays that leave it are left to the ray engine
+BATCH = 1 << 17  # triangles and boxes that are looked at together
 PAD = 0.004  # [cells] facets count as in a cell when this near to it, far more than the rounding of the way through
 GRAZING = 100.0  # times its thickness is the most that a point is moved off a facet along a ray
 NONE = -1
@@ -234,6 +235,33 @@ def grid_of(meshes: Sequence[np.ndarray], planes: np.ndarray, thickness: np.ndar
                 corners, planes, mesh, thickness, margin)  # fmt: skip
 
 
+def meets(corners: np.ndarray, planes: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return (n,) bool whether triangles (n, 3, 3), with their planes (n, 4), meet boxes of corners low, high (n, 3).
+
+    Plane and box, then edges and box seen along each axis (Schwarz & Seidel 2010, section 3.1); boxes that only the
+    triangle's own bounds miss are to be left out beforehand.
+    """
+    normal, size = planes[:, :3], high - low
+    height = np.einsum("ij,ij->i", normal, 0.5 * (low + high)) - planes[:, 3]
+    met: np.ndarray = np.abs(height) <= 0.5 * np.einsum("ij,ij->i", np.abs(normal), size)
+    for c in range(3):
+        a, b = (c + 1) % 3, (c + 2) % 3
+        sign = np.where(normal[:, c] < 0.0, -1.0, 1.0)
+        for i in range(3):
+            one, other = corners[:, i], corners[:, (i + 1) % 3]
+            across = sign * (one[:, b] - other[:, b])
+            along = sign * (other[:, a] - one[:, a])
+            inner = across * (np.where(across > 0.0, high[:, a], low[:, a]) - one[:, a])
+            inner += along * (np.where(along > 0.0, high[:, b], low[:, b]) - one[:, b])
+            met &= inner >= 0.0
+    return met
+
+
+def _batches(*arrays: np.ndarray) -> list[tuple[np.ndarray, ...]]:
+    """Return arrays of one length in pieces of BATCH rows."""
+    return [tuple(array[i : i + BATCH] for array in arrays) for i in range(0, len(arrays[0]), BATCH)]
+
+
 def cells_of(
     corners: np.ndarray, planes: np.ndarray, low: np.ndarray, edge: float, counts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -255,39 +283,26 @@ def cells_of(
     """
     from scipy.ndimage import distance_transform_edt
 
-    high, pad = low + edge * counts, PAD * edge
-    number, found = np.arange(len(corners)), [np.zeros(0, np.int64)]
-    while len(corners):
-        least, most = (
-            extreme(extreme(*corners[:, :2].swapaxes(0, 1)), corners[:, 2]) for extreme in (np.minimum, np.maximum)
-        )
-        least, most = least - pad, most + pad
-        reaches = ((most >= low) & (least <= high)).all(axis=1)
-        corners, number, least, most = corners[reaches], number[reaches], least[reaches], most[reaches]
-        sides = [corners[:, i] - corners[:, i - 1] for i in range(3)]
-        edges = np.stack([np.einsum("ij,ij->i", side, side) for side in sides], axis=1)  # squared
-        small = (edges <= ((1.0 - 3.0 * PAD) * edge) ** 2).all(axis=1)
-        ends = [np.floor((extreme[small] - low) / edge).astype(int) for extreme in (least, most)]
-        pieces = []
-        for choice in np.ndindex(2, 2, 2):  # a triangle no longer than a cell lies in at most eight
-            cell = np.stack([ends[choice[k]][:, k] for k in range(3)])
-            within = ((cell >= 0) & (cell < counts[:, None])).all(axis=0)
-            pieces.append(np.ravel_multi_index(tuple(cell[:, within]), tuple(counts)) << 32 | number[small][within])
-        found.append(np.unique(np.concatenate(pieces)))
-        # The others are cut across their longest edge
-        corners, longest, number = corners[~small], edges[~small].argmax(axis=1), number[~small]
-        row = np.arange(len(corners))
-        a, b, c = (corners[row, (longest + k) % 3] for k in (-1, 0, 1))
-        middle = 0.5 * (a + b)
-        corners = np.concatenate((np.stack((a, middle, c), axis=1), np.stack((middle, b, c), axis=1)))
-        number = np.concatenate((number, number))
-    both = np.unique(np.concatenate(found))
+    found = [np.zeros(0, np.int64)]
+    at = np.clip((corners - low) / edge, -2.0, counts + 2.0)
+    begin, end = (np.floor(at + sign * PAD).astype(int) for sign in (-1, 1))
+    begin, end = np.maximum(begin.min(axis=1), 0), np.minimum(end.max(axis=1) + 1, counts)
+    number = np.flatnonzero((begin < end).all(axis=1))
+    waiting = _batches(number, begin[number], end[number])
+    while waiting:
+        number, begin, end = waiting.pop()
+        met = meets(corners[number], planes[number], low + edge * (begin - PAD), low + edge * (end + PAD))
+        number, begin, end = number[met], begin[met], end[met]
+        size = end - begin
+        single = (size == 1).all(axis=1)
+        found.append(np.ravel_multi_index(tuple(begin[single].T), tuple(counts)) << 32 | number[single])
+        number, begin, end, axis = number[~single], begin[~single], end[~single], size[~single].argmax(axis=1)
+        row, upper, lower = np.arange(len(number)), begin.copy(), end.copy()
+        upper[row, axis] = lower[row, axis] = (begin[row, axis] + end[row, axis]) // 2
+        halves = np.tile(number, 2), np.concatenate((begin, upper)), np.concatenate((lower, end))
+        waiting += _batches(*halves)
+    both = np.sort(np.concatenate(found))
     cell, listed = both >> 32, (both & 0xFFFFFFFF).astype(np.int32)
-    # Only those cells that a triangle's plane comes through
-    middles = low + (np.stack(np.unravel_index(cell, tuple(counts)), axis=1) + 0.5) * edge
-    height = np.einsum("ij,ij->i", planes[listed, :3], middles) - planes[listed, 3]
-    through = np.abs(height) <= (0.5 + PAD) * edge * np.abs(planes[listed, :3]).sum(axis=1)
-    cell, listed = cell[through], listed[through]
     first = np.zeros(int(counts.prod()) + 1, np.int32)
     first[1:] = np.cumsum(np.bincount(cell, minlength=len(first) - 1))
     empty = (first[1:] == first[:-1]).reshape(tuple(counts))
