@@ -63,8 +63,8 @@ def main(
         raise UsageError("--absorption and --material both say how grains absorb: give one")
     if material is not None and unit is None:
         raise UsageError(f"absorption of {plain(material)} is per metre: say with --unit how long the scene unit is")
-    if not 0.0 < radius < math.inf:
-        raise UsageError(f"--radius is a finite number of scene units > 0, not {radius:g}")
+    if not 1e-30 <= radius <= 1e30:
+        raise UsageError(f"--radius is a number of scene units from 1e-30 to 1e30, not {radius:g}")
     if unit is not None and not 0.0 < unit < math.inf:
         raise UsageError(f"--unit is a finite number of metres > 0, not {unit:g}")
     products = times_radius(absorption, radius, unit, colours=True)

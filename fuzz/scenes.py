@@ -4,8 +4,9 @@
 
 A scene is one of a few sound ones, changed in structure (keys and tables gone, doubled, renamed, swapped with another
 scene's), in values (extremes of numbers, wrong types, other choices, other files) or in the bytes of its text. What can
-be built is rendered at 8 x 8 pixels, one sample each, and must be light: finite, and positive but for the gamut. Scene k of a seed is the
-same always; what fails is shown with its number and text. Tiles of the explicit level are cut to a few spheres.
+be built is rendered at 8 x 8 pixels, one sample each, and must be light: finite, and positive but for the gamut. Scene
+k of a seed is the same always; what fails is shown with its number and text. Tiles of the explicit level are cut to a
+few spheres.
 """
 
 import argparse

@@ -22,7 +22,7 @@ from tsdf.optics import UNPOLARISED, P, S, fresnel
 from tsdf.packing import Cells, cells_of, next_sphere, pack
 from tsdf.room import stands
 from tsdf.sampling import GOLDEN, key_of, mix, turn, unit
-from tsdf.scene import GrainSpec, Scene
+from tsdf.scene import GrainSpec, Scene, called
 from tsdf.table import Table
 from tsdf.vectors import KERNEL, dot, step, triple
 from tsdf.walker import write
@@ -274,7 +274,7 @@ def packed(scene: Scene, tables: Sequence[Table]) -> Packed:
     planes, centroids, first_facet = [np.zeros((0, 4))], [np.zeros((0, 3))], []
     facets, at = 0, 0
     for m, medium in enumerate(scene.media, 1):
-        where = f"{scene.name}: [[medium]] {m} ({medium.name})"
+        where = f"{scene.name}: {called('medium', m, medium.name)}"
         try:
             packing = pack(medium.packing_fraction, medium.packing_spheres, medium.packing_seed)
         except TSDFError as error:

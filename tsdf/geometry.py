@@ -21,7 +21,7 @@ from tsdf.grains import first_hit, grain_from_mesh, triangle_scene
 from tsdf.grid import Grid, free_around, grid_of
 from tsdf.meshes import read_mesh
 from tsdf.room import BALL, BOX, CLOSED, MESH, OPEN, SLAB, Room, exact_depth, room_of
-from tsdf.scene import FARTHEST, SMALLEST, Box, MediumSpec, Mesh, Rectangle, Scene, Slab, Sphere, SurfaceSpec
+from tsdf.scene import FARTHEST, SMALLEST, Box, MediumSpec, Mesh, Rectangle, Scene, Slab, Sphere, SurfaceSpec, called
 from tsdf.vectors import KERNEL, dot, step
 
 SLACK = 2e-6  # [of a facet's largest coordinate] a point this near to a facet is on it: 30 float32 ulps
@@ -283,13 +283,13 @@ def place(scene: Scene, grains: bool = False) -> Place:
     boundaries: list[Triangles | None] = []
     for number, medium in enumerate(scene.media, 1):
         if isinstance(medium.shape, Mesh):
-            mesh, found = _boundary(medium, f"{scene.name}: [[medium]] {number} ({medium.name})")
+            mesh, found = _boundary(medium, f"{scene.name}: {called('medium', number, medium.name)}")
             notes += found
             boundaries.append(mesh)
         else:
             boundaries.append(None)
     surfaces = [
-        None if isinstance(s.shape, Sphere) else _surface_mesh(s, f"{scene.name}: [[surface]] {i} ({s.name})")
+        None if isinstance(s.shape, Sphere) else _surface_mesh(s, f"{scene.name}: {called('surface', i, s.name)}")
         for i, s in enumerate(scene.surfaces, 1)
     ]
 
@@ -392,7 +392,7 @@ def _check_sizes(scene: Scene, boundaries: Sequence[Triangles | None], surfaces:
             assert isinstance(shape, Box | Slab)
             low, high = (np.ones(3) * end for end in (shape.low, shape.high))
         kind, number = ("medium", i + 1) if i < media else ("surface", i + 1 - media)
-        title = f"{scene.name}: [[{kind}]] {number} ({spec.name})"
+        title = f"{scene.name}: {called(kind, number, spec.name)}"
         size, farthest = float((high - low).max()), float(max(np.abs(low).max(), np.abs(high).max()))
         if not (size >= max(SMALLEST, DIGITS * farthest) and farthest <= FARTHEST):
             raise SceneError(
@@ -501,12 +501,10 @@ def _no_overlap(made: Place, scene: Scene, single: bool) -> None:
             both = made.inside(i, points) & made.inside(j, points)
             if both.any():
                 at = "({:.4g}, {:.4g}, {:.4g})".format(*(points[both][0] + made.centre))
-                a, b = scene.media[j].name, scene.media[i].name
+                a, b = (called("medium", k + 1, scene.media[k].name) for k in (j, i))
                 if "centres" in (scene.media[i].inside, scene.media[j].inside) and single:
                     raise SceneError(
-                        f"{scene.name}: grains of media {a!r} and {b!r} reach into each other, at {at} for one, for "
+                        f"{scene.name}: grains of {a} and {b} reach into each other, at {at} for one, for "
                         'only their centres are inside; leave room between the media, or say inside = "grains"'
                     )
-                raise SceneError(
-                    f"{scene.name}: media {a!r} and {b!r} overlap, at {at} for one; move or cut one of them"
-                )
+                raise SceneError(f"{scene.name}: {a} and {b} overlap, at {at} for one; move or cut one of them")

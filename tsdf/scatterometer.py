@@ -196,7 +196,7 @@ def grain_header(grain: Grain) -> dict[str, Any]:
 def canonical_command(grain: Mapping[str, Any], optics: Optics, effort: Effort, traced: bool) -> str:
     """Return the command that makes the same table: no paths of this machine, no threads, no chunks, no target."""
     words = ["tsdf-build", shlex.quote(grain["name"])]
-    words += ["--repair"] if any(note.startswith("repair") for note in grain["notes"]) else []
+    words += ["--repair-any"] if any(note.startswith("repair") for note in grain["notes"]) else []
     words += [f"--set {key}={value}" for key, value in grain["parameters"].items()]
     if optics.material is not None:
         words += [f"--material {shlex.quote(optics.material)}", f"--wavelength-nm {optics.wavelength_nm!r}"]
