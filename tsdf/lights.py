@@ -25,6 +25,7 @@ from tsdf.vectors import KERNEL, frame, step
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # [1] of linear sRGB, IEC 61966-2-1
 CONTRAST = 4.0  # times the mean luminance of an environment that need not be aimed at
+PARTS = 4  # of z, for each row of an environment, by which its row is found
 SMALLEST_DEG = 1e-6  # below, a disc is no wider than the rounding of directions
 
 Sun = tuple[npt.ArrayLike, float, npt.ArrayLike]
@@ -40,6 +41,9 @@ class LightArrays(NamedTuple):
     aim: np.ndarray  # (h, w) by how much each pixel is aimed at [luminance]
     rows: np.ndarray  # (h,) running sum of `aim` times cosine difference
     columns: np.ndarray  # (h, w) running sum of `aim` along each row
+    row_guide: np.ndarray  # (power of two,) int32: row in which each of as many equal parts of `rows` begins
+    column_guide: np.ndarray  # (h, power of two) int32: as `row_guide`, for `columns`
+    height_guide: np.ndarray  # (parts,) int32: row that each of as many equal parts of z, from 1 down to -1, begins in
     sun_direction: np.ndarray  # (n, 3) toward the centre of each sun
     sun_chord2: np.ndarray  # (n,) squared distance of centre and edge of the disc on the unit sphere
     sun_radiance: np.ndarray  # (n, 3)
@@ -112,6 +116,9 @@ def compile_lights(
         aim=aim,
         rows=rows,
         columns=columns,
+        row_guide=_guide(rows),
+        column_guide=np.array([_guide(sums) for sums in columns], np.int32).reshape(height, -1 if height else 1),
+        height_guide=_heights(cos_edges),
         sun_direction=direction,
         sun_chord2=chord2,
         sun_radiance=radiance,
@@ -137,6 +144,20 @@ def _colours(value: npt.ArrayLike, name: str, shape: tuple[int, ...] | None) -> 
     return colours
 
 
+def _guide(sums: np.ndarray) -> np.ndarray:
+    """Return the cell of a running sum that each of equal parts of it begins in, as `_cell` has it, int32."""
+    parts = 1 << max(sums.size - 1, 0).bit_length()  # a power of two, so that a number is in the part that it says
+    starts = np.arange(parts) / parts * sums[-1:] if sums.size else np.zeros(parts)
+    return np.minimum(np.searchsorted(sums, starts, side="right"), max(sums.size - 1, 0)).astype(np.int32)
+
+
+def _heights(cos_edges: np.ndarray) -> np.ndarray:
+    """Return the row that each of equal parts of z begins in at the top, int32."""
+    parts = PARTS * (cos_edges.size - 1)
+    tops = 1.0 - 2.0 * np.arange(parts) / max(parts, 1) + 2.0**-50  # the part of a z is rounded
+    return np.searchsorted(-cos_edges[1:-1], -tops, side="right").astype(np.int32)
+
+
 def _disc(
     number: int, direction: npt.ArrayLike, diameter_deg: float, irradiance: npt.ArrayLike
 ) -> tuple[np.ndarray, float, np.ndarray]:
@@ -155,17 +176,30 @@ def _disc(
     return centre / np.linalg.norm(centre), 4.0 * math.sin(0.5 * half) ** 2, colour / (math.pi * math.sin(half) ** 2)
 
 
-@njit(inline="always", **KERNEL)  # as a call, it would count references to each array: twice the time
-def _sent(lights, direction):
-    """Return the radiance of environment and suns, and the density with which `draw` makes a direction [1/sr]."""
+@njit(forceinline=True, **KERNEL)
+def _pixel(lights, direction):
+    """Return row and column of the environment in a direction."""
+    x, y, z = direction
+    height, width = lights.environment.shape[0], lights.environment.shape[1]
+    part = int((1.0 - z) * (0.5 * lights.height_guide.size))
+    row = lights.height_guide[max(0, min(part, lights.height_guide.size - 1))]
+    while row < height - 1 and z <= lights.cos_edges[row + 1]:
+        row += 1
+    along = lights.rotation - math.atan2(y, x) / (2.0 * math.pi)
+    return row, max(0, min(width - 1, int((along - math.floor(along)) * width)))
+
+
+@njit(forceinline=True, **KERNEL)
+def _sent(lights, direction, row, column):
+    """Return the radiance of environment and suns, and the density with which `draw` makes a direction [1/sr].
+
+    The pixel of the environment is that given, or looked for if its row is negative.
+    """
     x, y, z = direction
     r = g = b = density = 0.0
-    height = lights.environment.shape[0]
-    if height > 0:
-        width = lights.environment.shape[1]
-        along = lights.rotation - math.atan2(y, x) / (2.0 * math.pi)
-        row = max(0, min(height - 1, int(math.atan2(math.sqrt(x * x + y * y), z) / math.pi * height)))
-        column = max(0, min(width - 1, int((along - math.floor(along)) * width)))
+    if lights.environment.shape[0] > 0:
+        if row < 0:
+            row, column = _pixel(lights, direction)
         r = lights.environment[row, column, 0]
         g = lights.environment[row, column, 1]
         b = lights.environment[row, column, 2]
@@ -184,7 +218,7 @@ def _sent(lights, direction):
 @njit(**KERNEL)
 def pdf(lights, direction):
     """Return the density with which `draw` makes a direction, 0 where nothing is drawn [1/sr]."""
-    return _sent(lights, direction)[3]
+    return _sent(lights, direction, -1, -1)[3]
 
 
 @njit(**KERNEL)
@@ -201,17 +235,22 @@ def radiance(lights, direction, weight_pdf):
         weight_pdf / (weight_pdf + pdf). Negative: the path had no partner from `draw` (camera rays, delta atoms)
         and all counts in full, as the constant always does (Veach 1997, eq. 9.8).
     """
-    r, g, b, density = _sent(lights, direction)
+    r, g, b, density = _sent(lights, direction, -1, -1)
     weight = 1.0
     if weight_pdf >= 0.0 and density > 0.0:
         weight = weight_pdf / (weight_pdf + density)
     return lights.constant[0] + weight * r, lights.constant[1] + weight * g, lights.constant[2] + weight * b
 
 
-@njit(**KERNEL)
-def _cell(sums, x):
-    """Return the cell of a running sum that x lies in, and how far in it, in [0, 1]; never an empty cell."""
-    i = min(np.searchsorted(sums, x, side="right"), sums.size - 1)
+@njit(forceinline=True, **KERNEL)
+def _cell(sums, i, x):
+    """Return the cell of a running sum that x lies in, and how far in it, in [0, 1]; never an empty cell.
+
+    It is looked for from i on, which is not beyond it.
+    """
+    last = sums.size - 1
+    while i < last and x >= sums[i]:
+        i += 1
     low = sums[i - 1] if i > 0 else 0.0
     return i, (x - low) / (sums[i] - low)
 
@@ -236,10 +275,13 @@ def draw(lights, u0, u1, u2):
     """
     if not lights.sampled:
         return (0.0, 0.0, 1.0), 0.0, (0.0, 0.0, 0.0)
-    chosen = _cell(lights.shares, u0)[0]
+    chosen = _cell(lights.shares, 0, u0)[0]
+    row, column = -1, -1
     if chosen == 0:
-        row, down = _cell(lights.rows, u1 * lights.rows[-1])
-        column, along = _cell(lights.columns[row], u2 * lights.columns[row, -1])
+        begin = lights.row_guide[int(u1 * lights.row_guide.size)]
+        row, down = _cell(lights.rows, begin, u1 * lights.rows[-1])
+        sums, guide = lights.columns[row], lights.column_guide[row]
+        column, along = _cell(sums, guide[int(u2 * guide.size)], u2 * sums[-1])
         z = lights.cos_edges[row] + down * (lights.cos_edges[row + 1] - lights.cos_edges[row])
         azimuth = lights.rotation - (column + along) / lights.columns.shape[1]
         c, s = turn(azimuth - math.floor(azimuth))
@@ -253,7 +295,7 @@ def draw(lights, u0, u1, u2):
         rho = math.sqrt(drop * (2.0 - drop))
         c, d = turn(u2)
         direction = step(step(step(centre, -drop, centre), rho * c, s), rho * d, t)
-    r, g, b, density = _sent(lights, direction)
-    if density <= 0.0:  # rounding can carry an edge to where nothing is drawn
+    r, g, b, density = _sent(lights, direction, row, column)
+    if density <= 0.0:  # rounding can carry the edge of a sun to where nothing is drawn
         return direction, 0.0, (0.0, 0.0, 0.0)
     return direction, density, (r, g, b)
