@@ -35,12 +35,11 @@ class LightArrays(NamedTuple):
     """The lights of a scene as the kernels take them; made by `compile_lights`."""
 
     constant: tuple[float, float, float]  # radiance
-    environment: np.ndarray  # (h, w, 3) radiance, h = 0 where there is none
+    environment: np.ndarray  # (h, w, 4) radiance and by how much it is aimed at [luminance]; h = 0 where there is none
     rotation: float  # [turns] azimuth of the left edge of column 0, which falls from there
     cos_edges: np.ndarray  # (h + 1,) cosine of the polar angle of the rows' edges, from 1 to -1
-    aim: np.ndarray  # (h, w) by how much each pixel is aimed at [luminance]
-    rows: np.ndarray  # (h,) running sum of `aim` times cosine difference
-    columns: np.ndarray  # (h, w) running sum of `aim` along each row
+    rows: np.ndarray  # (h,) running sum of what is aimed at times cosine difference
+    columns: np.ndarray  # (h, w) running sum of it along each row
     row_guide: np.ndarray  # (power of two,) int32: row in which each of as many equal parts of `rows` begins
     column_guide: np.ndarray  # (h, power of two) int32: as `row_guide`, for `columns`
     height_guide: np.ndarray  # (parts,) int32: row that each of as many equal parts of z, from 1 down to -1, begins in
@@ -48,7 +47,7 @@ class LightArrays(NamedTuple):
     sun_chord2: np.ndarray  # (n,) squared distance of centre and edge of the disc on the unit sphere
     sun_radiance: np.ndarray  # (n, 3)
     shares: np.ndarray  # (n + 1,) running sum of the probability to draw the environment, then each sun
-    power: float  # `aim` and luminance of suns, integrated over directions
+    power: float  # what is aimed at and luminance of suns, integrated over directions
     sampled: bool  # whether there is anything to draw
 
 
@@ -110,10 +109,9 @@ def compile_lights(
     shares = np.cumsum(powers)
     return LightArrays(
         constant=(float(everywhere[0]), float(everywhere[1]), float(everywhere[2])),
-        environment=pixels,
+        environment=np.concatenate((pixels, aim[..., None]), axis=2),
         rotation=math.fmod(rotation_deg, 360.0) / 360.0,
         cos_edges=cos_edges,
-        aim=aim,
         rows=rows,
         columns=columns,
         row_guide=_guide(rows),
@@ -203,7 +201,7 @@ def _sent(lights, direction, row, column):
         r = lights.environment[row, column, 0]
         g = lights.environment[row, column, 1]
         b = lights.environment[row, column, 2]
-        density = lights.aim[row, column]
+        density = lights.environment[row, column, 3]
     for i in range(lights.sun_chord2.size):
         dx, dy, dz = x - lights.sun_direction[i, 0], y - lights.sun_direction[i, 1], z - lights.sun_direction[i, 2]
         if dx * dx + dy * dy + dz * dz < lights.sun_chord2[i]:  # a cosine could not tell small discs apart

@@ -254,11 +254,18 @@ def deflection(world, c, u0, key):
 
 
 @njit(**KERNEL)
+def alone(g, m):
+    """Return whether nothing is in the scene but medium m in an exact shape, all of which are convex: what begins and
+    ends in it is in it all the way."""
+    return g.kind.shape[0] == 1 and g.kind[m] != MESH and g.balls.shape[0] == 0 and not g.solid
+
+
+@njit(**KERNEL)
 def wander(world, batch, w, amounts, once):
     """Take a walker that is in a known medium from event to event while nothing else can be met.
 
-    With `once` it is known that the walker reaches the end of its free path: one event. A jump that may meet something
-    is left to `land`. Returns LOOK, WAIT or ENDED.
+    With `once` it is known that the walker reaches the end of its free path: one event. A flight that may meet
+    something is left to `fly`, a jump to `land`. Returns LOOK, WAIT or ENDED.
     """
     g, media, absorption, sampled = world.geometry, world.media, world.absorption, world.lights.sampled
     m = w.medium
@@ -268,6 +275,7 @@ def wander(world, batch, w, amounts, once):
     luck, pdf, steps, state = w.luck, w.pdf, 0, LOOK
     patience = min(PATIENCE, media.limit - w.events)
     bound, fresh = clearance(g, m, p), True
+    convex, hair = alone(g, m), HAIR * g.slack[m]
     while True:
         if free < 0.0:
             key += GOLDEN
@@ -275,7 +283,7 @@ def wander(world, batch, w, amounts, once):
         if not once and bound <= free:
             if not fresh:
                 bound = clearance(g, m, p)
-            if bound <= free:
+            if bound <= free and not (convex and bound > 0.0 and clearance(g, m, step(p, free, d)) > hair):
                 break
         if steps >= patience or (not once and full(batch)):
             state = WAIT
@@ -321,7 +329,11 @@ def wander(world, batch, w, amounts, once):
                 bound = clearance(g, m, p)
             if bound <= size and size > 0.0:
                 aim(w, offset, size, d, length, c)
-                once = True
+                end = step(p, size, triple(w.e))
+                if convex and bound > 0.0 and clearance(g, m, end) > hair:
+                    w.mode, p, bound = FLY, end, 0.0
+                else:
+                    once = True
             else:
                 p = step(p, scale, offset)
                 bound -= size
@@ -463,6 +475,16 @@ def bounce(world, batch, w, amounts, d, met):
 
 
 @njit(**KERNEL)
+def escape(world, batch, w, amounts):
+    """End a walker that meets nothing more in the light that it finds."""
+    if w.shadow:
+        find(world, batch, w, amounts, (1.0, 1.0, 1.0))
+    else:
+        find(world, batch, w, amounts, light_from(world.lights, triple(w.d), w.pdf))
+    return ENDED
+
+
+@njit(**KERNEL)
 def again(batch, w, slack):
     """Move the start of a walker's next ray beyond a facet that the ray engine sees and that is behind it."""
     w.skip = max(2.0 * w.skip, slack)
@@ -501,8 +523,8 @@ def land(world, batch, w, amounts):
     move = min(beyond(slack_b, dot(n_b, e)), 0.5 * (t - t_b)) if inside else 0.0
     if leaves:
         for k in range(g.kind.shape[0]):
-            t_k, inside, n_k, slack_k, spurious = boundary_met(g, k, p, e, hits, w.ray, False)
-            if k != m and not inside and not spurious and abs(t_k - t_b) * abs(dot(n_k, e)) <= slack_b + slack_k:
+            t_k, within, n_k, slack_k, spurious = boundary_met(g, k, p, e, hits, w.ray, False)
+            if k != m and not within and not spurious and abs(t_k - t_b) * abs(dot(n_k, e)) <= slack_b + slack_k:
                 # Another medium begins where this one ends: the grain lies in both
                 gone = min(t_b + move, w.length)
                 write(w.p, step(p, gone, e))
@@ -514,10 +536,13 @@ def land(world, batch, w, amounts):
     if leaves:
         if slot >= 0:
             amounts[slot] -= w.gained * (1.0 - t_b / w.length)
-        if dot(triple(w.q), n_b) < 0.0:
+        outward = dot(triple(w.q), n_b)
+        if outward < 0.0:
             move = -min(move, 0.5 * t_b)
         write(w.p, step(p, t_b + move, e))
         w.medium = UNKNOWN
+        if inside and outward > 0.0 and alone(g, m):
+            return escape(world, batch, w, amounts)
     else:
         write(w.p, step(p, w.length, e))
     return LOOK
@@ -561,12 +586,8 @@ def fly(world, batch, w, amounts):
         if w.events >= media.limit:
             batch.counters[TRUNCATED] += 1
             return ENDED
-        return LOOK
-    if w.shadow:
-        find(world, batch, w, amounts, (1.0, 1.0, 1.0))
-    else:
-        find(world, batch, w, amounts, light_from(world.lights, d, w.pdf))
-    return ENDED
+        return escape(world, batch, w, amounts) if home != NONE and alone(g, home) else LOOK
+    return escape(world, batch, w, amounts)
 
 
 @njit(**KERNEL)

@@ -120,7 +120,10 @@ def born(batch, amounts):
 @njit(**KERNEL)
 def absorbed(absorption, amounts):
     """Return the colour that the amounts of matter crossed leave of white light."""
-    if absorption.least.shape[0] == 0:
+    crossed = False
+    for i in range(amounts.shape[0]):
+        crossed |= amounts[i] != 0.0
+    if not crossed:
         return 1.0, 1.0, 1.0
     r, g, b = 0.0, 0.0, 0.0
     if absorption.spectral.shape[0] == 0:
@@ -138,6 +141,9 @@ def absorbed(absorption, amounts):
         er += absorption.rgb[0, i] * amounts[i]
         eg += absorption.rgb[1, i] * amounts[i]
         eb += absorption.rgb[2, i] * amounts[i]
+    if er == eg and er == eb:
+        grey = math.exp(er)
+        return r * grey, g * grey, b * grey
     return r * math.exp(er), g * math.exp(eg), b * math.exp(eb)
 
 
