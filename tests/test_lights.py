@@ -8,7 +8,7 @@ from numba import njit
 from scipy.stats import chi2
 
 from tsdf.errors import UsageError
-from tsdf.lights import compile_lights, draw, pdf, radiance
+from tsdf.lights import LUMINANCE, compile_lights, draw, pdf, radiance
 from tsdf.sampling import turn
 from tsdf.vectors import dot
 
@@ -135,6 +135,25 @@ def test_the_ends_of_the_random_numbers(u):
                 assert np.isfinite([*d, p, *rgb]).all()
                 assert p > 0.0 or rgb == (0.0, 0.0, 0.0)
                 assert abs(np.linalg.norm(d) - 1.0) < 1e-12
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 9), (5, 1), (16, 32), (33, 70)])
+def test_guides_lead_to_the_cell_that_a_search_finds(height, width):
+    """Row and column of a draw are those of a search through the running sums, made here from the pixels.
+
+    One pixel has nearly all light, some rows have none, so that many cells lie in one part of a guide.
+    """
+    pixels = sky(height, width) if height > 1 else sky(9, width)[:1] + 0.01
+    pixels[0, width // 2] = 1e3
+    lights = compile_lights(environment=pixels, contrast=0.0)
+    aim = pixels @ LUMINANCE
+    rows = np.cumsum(-np.diff(np.cos(np.linspace(0.0, math.pi, height + 1))) * aim.sum(axis=1))
+    for u in np.random.default_rng(7).random((500, 3)) ** (1.0, 0.2, 1.0):  # most of the rows' numbers near 1
+        x, y, z = draw(lights, *u)[0]
+        row = np.searchsorted(rows, u[1] * rows[-1], side="right")
+        column = np.searchsorted(np.cumsum(aim[row]), u[2] * aim[row].sum(), side="right")
+        assert math.floor(math.acos(z) / math.pi * height) == row
+        assert math.floor(-math.atan2(y, x) / (2.0 * math.pi) % 1.0 * width) == column
 
 
 # ------------------------------------------------------------------------------------------ irradiance

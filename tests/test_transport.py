@@ -15,6 +15,7 @@ from tsdf.optics import Optics
 from tsdf.render import Picture
 from tsdf.scatterometer import Effort
 from tsdf.scene import (
+    Absorption,
     Box,
     Camera,
     ConstantLight,
@@ -26,6 +27,7 @@ from tsdf.scene import (
     Scene,
     Slab,
     Sphere,
+    SunLight,
     SurfaceSpec,
 )
 
@@ -357,6 +359,23 @@ def test_deep_steps_change_nothing(level, folder, ball, monkeypatch):
     blind = reflectance(replace(made, place=place), 20_000, seed=1)
     assert blind.rays > 1.2 * expected.rays
     assert agree(blind, expected)
+
+
+@pytest.mark.parametrize("level", ["teleport", "volume", "explicit"])
+@pytest.mark.parametrize("shape", ["slab", "box", "ball"])
+def test_a_shape_alone_is_as_beside_others(shape, level, folder, ball):
+    """What is answered on the spot in one exact shape alone is what looking step by step finds, to the last bit.
+
+    A ball too far and small to be met makes it look. Light from one side and a loss in the grains tell where light
+    leaves, and how far it went.
+    """
+    grain = GrainSpec(ball, absorption=Absorption("grey", (0.1,)))
+    medium = MediumSpec(shape_of(shape, folder), 0.5, 1.0, (grain,), name="medium", packing_spheres=400)
+    alone = Scene(OUTSIDE, (*ONE, SunLight((0.3, -0.8, 0.5), (1.0, 2.0, 3.0), 20.0)), (medium,))
+    beside = replace(alone, surfaces=(black(Sphere((0.0, 900.0, 0.0), 1e-3)),))
+    first, second = take(alone, level, spp=4), take(beside, level, spp=4)
+    assert (first.rgb == second.rgb).all()
+    assert first.rgb.std() > 0.1 and first.events == second.events > 0
 
 
 @pytest.mark.parametrize("level", LEVELS)
