@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core import caching, cpu, event
+from numba.core import caching, cpu, event, types
 
 from tsdf.files import whole
 
@@ -35,12 +35,22 @@ def njit(**options: Any) -> Callable[[Any], Any]:
 
     def compiled(function: Any) -> Any:
         kernel = numba.njit(**options)(function)
+        template = kernel.get_call_template
+        kernel.get_call_template = lambda args, kws: template([_any(kind) for kind in args], kws)
         if kept:
             with contextlib.suppress(RuntimeError):  # nowhere to keep it, which `_fallback` has said
                 kernel._cache = _Cache(function)
         return kernel
 
     return compiled
+
+
+def _any(kind: Any) -> Any:
+    """Return the type of an argument, of a number that is written there that of any such number.
+
+    Else numba compiles a kernel anew for each number that others call it with, and for each 0 that they count from.
+    """
+    return types.unliteral(kind) if isinstance(kind, types.IntegerLiteral | types.BaseTuple) else kind
 
 
 @cache

@@ -18,17 +18,15 @@ from tsdf.errors import SceneError, TSDFError
 from tsdf.geometry import planes_of
 from tsdf.grains import Grain, embree_scene, grain_from_mesh, load_grain
 from tsdf.meshes import read_mesh
-from tsdf.optics import UNPOLARISED, P, S, fresnel
+from tsdf.optics import OFFSET, UNPOLARISED, P, S, fresnel, nearer, on_plane, parted, sound
 from tsdf.packing import Cells, cells_of, next_sphere, pack
 from tsdf.room import stands
 from tsdf.sampling import GOLDEN, key_of, mix, turn, unit
 from tsdf.scene import GrainSpec, Scene, called
 from tsdf.table import Table
-from tsdf.vectors import KERNEL, dot, step, triple
+from tsdf.vectors import KERNEL, dot, renewed, step, triple
 from tsdf.walker import write
 
-OFFSET = 1e-5  # [R] restart distance off a facet along its normal, as in `tracer`
-RETRY = 1e-3  # share of the way to the facet's centroid by which a failed restart is moved
 EXACT_SPHERE = -1
 ENTERED, INSIDE, RETRIED, LEFT = 0, 1, 2, 4
 
@@ -163,33 +161,25 @@ def at_facet(grains, w, facet):
     if facet < 0 and not inside:
         w.facet = facet
         return p, d, 0.0, LEFT, False
-    n, cosine, t = (0.0, 0.0, 0.0), 0.0, 0.0
-    lost = facet < 0
-    if not lost:
-        n = (grains.planes[facet, 0], grains.planes[facet, 1], grains.planes[facet, 2])
-        cosine = dot(n, d)
-        t = (grains.planes[facet, 3] - dot(n, p)) / cosine
-    if lost or (cosine > 0.0) != inside or not (-10.0 * OFFSET <= t <= 2.5):
+    n, cosine, t = (0.0, 0.0, 0.0), 0.0, math.inf
+    if facet >= 0:
+        n, cosine, t = on_plane(grains.planes[facet], p, d)
+    if not sound(cosine, t, inside):
         if last < 0 or w.state & RETRIED:
             w.facet = facet
             return p, d, 0.0, LEFT, inside
-        write(w.e, step(p, RETRY, step(triple(grains.centroids[last]), -1.0, p)))
+        write(w.e, nearer(grains.centroids[last], p))
         return p, d, 0.0, w.state | RETRIED, False
     t = max(t, 0.0)
     p = step(p, t, d)
     length = t if inside else 0.0
-    ratio = 1.0 / eta if inside else eta
-    cos_i = min(abs(cosine), 1.0)
-    reflectance, cos_t = fresnel(cos_i, ratio, UNPOLARISED)
+    reflectance, mirrored, refracted = parted(d, n, cosine, 1.0 / eta if inside else eta, UNPOLARISED)
     w.key = mix(w.key + GOLDEN)
     if unit(w.key) < reflectance:
-        d = step(d, -2.0 * cosine, n)
+        d = mirrored
     else:
-        bend = cos_t - cos_i / ratio
-        d = step((d[0] / ratio, d[1] / ratio, d[2] / ratio), bend if cosine > 0.0 else -bend, n)
-        inside = not inside
-    half = 1.5 - 0.5 * dot(d, d)
-    d = (d[0] * half, d[1] * half, d[2] * half)
+        d, inside = refracted, not inside
+    d = renewed(d)
     p = step(p, -OFFSET if inside else OFFSET, n)
     write(w.e, p)
     w.facet = facet

@@ -1,16 +1,24 @@
-"""Light meets a surface: the optical constants that a table is made for, and Fresnel reflectance.
+"""Light meets a surface: the optical constants that a table is made for, Fresnel reflectance, and a hit on a facet.
 
-Directions are those of propagation. `Optics.eta` is that of the grain, n_inside / n_outside; `fresnel` takes that of
-the hit at hand, n_transmitted / n_incident.
+Directions are those of propagation. `Optics.eta` is that of the grain, n_inside / n_outside; `fresnel` and `parted`
+take that of the hit at hand, n_transmitted / n_incident. A ray engine says which facet light meets; where, is computed
+here in float64 from the facet's plane. A ray restarts `OFFSET` off the facet along its geometric normal.
 """
 
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from tsdf.compiled import njit
 from tsdf.errors import UsageError
+from tsdf.vectors import KERNEL, dot, step, triple
+
+Triple = tuple[float, float, float]
 
 UNPOLARISED, S, P = 0, 1, 2
+OFFSET = 1e-5  # restart distance along the geometric normal [R]: 1e-7 to 1e-4 leave no self-hits, 1e-3 biases
+RETRY = 1e-3  # share of the way to the facet's centroid by which a failed restart is moved
 ETA = (1e-30, 1e30)  # that a table may have (schema/SPEC.md); 1e9 is a mirror to nine digits
 
 
@@ -80,3 +88,39 @@ def fresnel(cos_i: float, eta: float, polarisation: int) -> tuple[float, float]:
     if polarisation == P:
         return r_p * r_p, cos_t
     return 0.5 * (r_s * r_s + r_p * r_p), cos_t
+
+
+@njit(forceinline=True, **KERNEL)
+def sound(cosine: float, t: float, inside: bool) -> bool:
+    """Return whether light on that side of a surface can meet it from there, at that angle and distance [R]."""
+    return (cosine > 0.0) == inside and -10.0 * OFFSET <= t <= 2.5
+
+
+@njit(forceinline=True, **KERNEL)
+def on_plane(plane: np.ndarray, p: Triple, d: Triple) -> tuple[Triple, float, float]:
+    """Return a facet's normal, its cosine with d and the distance along d from p to the facet's plane."""
+    n = triple(plane)
+    cosine = dot(n, d)
+    return n, cosine, (plane[3] - dot(n, p)) / cosine
+
+
+@njit(forceinline=True, **KERNEL)
+def nearer(centroid: np.ndarray, p: Triple) -> Triple:
+    """Return where a ray from p that lost its grain, at an edge or a vertex, is tried again: nearer the middle."""
+    return step(p, RETRY, step(triple(centroid), -1.0, p))
+
+
+@njit(forceinline=True, **KERNEL)
+def parted(d: Triple, n: Triple, cosine: float, ratio: float, polarisation: int) -> tuple[float, Triple, Triple]:
+    """Part light along d at a surface of normal n; return reflectance, reflected and refracted direction.
+
+    `cosine` is that of d and n, `ratio` n_transmitted / n_incident. The refracted direction says nothing where the
+    reflectance is 1.
+    """
+    cos_i = min(abs(cosine), 1.0)
+    reflectance, cos_t = fresnel(cos_i, ratio, polarisation)
+    bent = d
+    if ratio != 1.0:
+        bend = cos_t - cos_i / ratio
+        bent = step(step((0.0, 0.0, 0.0), 1.0 / ratio, d), bend if cosine > 0.0 else -bend, n)
+    return reflectance, step(d, -2.0 * cosine, n), bent

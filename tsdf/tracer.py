@@ -1,8 +1,8 @@
 """Light through one grain: sample an incoming ray, follow it until it leaves the bounding sphere, count it.
 
-Embree finds the facets, one fused kernel does the rest: Fresnel, splitting, restart, counting, compaction. Only the
-facet's number is taken from Embree; the hit is recomputed in float64 from the facet's plane, so that the result does
-not depend on the last bits of a ray engine. A ray restarts `OFFSET` off the facet along its geometric normal.
+Embree finds the facets, `advance` does the rest in one go over all rays: Fresnel, splitting, restart, counting,
+compaction. Only the facet's number is taken from Embree; the hit is recomputed in float64 (`optics`), so that the
+result does not depend on the last bits of a ray engine.
 
 Light splits in two at a hit. A part lighter than `SPLIT` goes on with that much or not at all, at random, and the other
 part has the rest, so that no energy is made or lost; a part that leaves for good may be lighter, for it needs no ray.
@@ -16,20 +16,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Event
+from typing import NamedTuple
 
 import numpy as np
 
 from tsdf import tally as T
 from tsdf.compiled import njit
 from tsdf.grains import Grain, embree_scene
+from tsdf.handle import Handle
 from tsdf.horizon import UNKNOWN, horizon_of
-from tsdf.optics import UNPOLARISED, fresnel
+from tsdf.optics import OFFSET, UNPOLARISED, P, S, nearer, on_plane, parted, sound
 from tsdf.sampling import GOLDEN, SOBOL, key_of, mix, sobol, turn, unit
 from tsdf.tally import Tally
-from tsdf.vectors import cross, dot, frame, minus, step, triple
+from tsdf.vectors import KERNEL, cross, dot, frame, minus, renewed, step, triple
 
-OFFSET = 1e-5  # restart distance along the geometric normal [R]: 1e-7 to 1e-4 leave no self-hits, 1e-3 biases
-RETRY = 1e-3  # share of the way to the facet's centroid by which a failed restart is moved
 LIGHT = T.UNIT // 16  # light that weighs less is counted one way, as it is or walked backwards, with the weight of both
 NO_OFFSET = 1e-9  # light that leaves this near to where it came in leaves there [R]
 ATOM = 1e-5  # deflections closer than this to 0 or pi are exact for float32 geometry [rad]
@@ -48,14 +48,92 @@ RAY = np.dtype(
 INSIDE, RETRIED, MET, P_POLARISED = 1, 2, 4, 8
 OTHER = np.uint64(0xA5A5A5A5A5A5A5A5)  # turns a random key into that of the other branch
 
-# Light that leaves is counted in blocks. Rows of `left`: where it starts for the rim, its direction, where the light
-# entered, its direction, the length inside (13); of `notes`: weight, path, key; of `found`, see `measure`:
-BLOCK = 128  # small enough for the first-level cache
-COS_THETA, THETA, FORTH, BACK = 0, 1, 2, 5  # r, z, phi_delta follow in the rows from FORTH and BACK
+BLOCK = 128  # light that leaves counted together: small enough for the first-level cache
+COS_THETA, THETA, FORTH, BACK = 0, 1, 2, 5  # rows of `Block.found`; r, z, phi_delta follow in those from FORTH and BACK
+
+KEPT_APART = 3  # polarisations: each path has one
 
 BOX_PHI, BOX_R, BOX_Z, BOX_L = (T.BOX[name] for name in ("phi", "r", "z", "l"))
 
 GOLDEN_C, GOLDEN_S = math.cos(2.0 * math.pi * 0.6180339887498949), math.sin(2.0 * math.pi * 0.6180339887498949)
+
+
+class Task(NamedTuple):
+    """A grain and how it is traced.
+
+    sphere: it is the exact sphere, one facet that says nothing; planes (n, 4): normal and height over the origin of
+    each facet; centroids (n, 3), horizon (n,): see `horizon_of`; polarisation: that of `fresnel` or KEPT_APART; split:
+    the weight to which lighter parts are raised; fan: directions in which a facet is lit; sobol: direction numbers.
+    The rest as in `Tracer`.
+    """
+
+    sphere: bool
+    planes: np.ndarray
+    centroids: np.ndarray
+    horizon: np.ndarray
+    eta: float
+    polarisation: int
+    reflectance_scale: float
+    split: int
+    fan: int
+    max_bounces: int
+    seed: int
+    plain: bool
+    sobol: np.ndarray
+
+
+class Rays(NamedTuple):
+    """Rays (n,) under way, those that go on after a hit, and their starts and ways (n, 3) for the ray engine."""
+
+    now: np.ndarray
+    then: np.ndarray
+    starts: np.ndarray
+    ways: np.ndarray
+
+
+class Block(NamedTuple):
+    """Light that left and is still to be counted, in columns.
+
+    left (13, n): where it starts for the rim, its direction, where the light entered, its direction, the length inside;
+    notes (3, n) int64: weight, path, key; found (8, n): see `measure`.
+    """
+
+    left: np.ndarray
+    notes: np.ndarray
+    found: np.ndarray
+
+
+class Counts(NamedTuple):
+    """The arrays of a `Tally`, and the edges of its cells of path length."""
+
+    scalars: np.ndarray
+    theta: np.ndarray
+    cells: np.ndarray
+    box: np.ndarray
+    box_l: np.ndarray
+    records: np.ndarray
+    entry: np.ndarray
+    entry_records: np.ndarray
+    edges: np.ndarray
+
+
+class Past(NamedTuple):
+    """What light has behind it: where and along what direction it entered, the length inside so far, its path."""
+
+    entry: tuple[float, float, float]
+    d_in: tuple[float, float, float]
+    length: float
+    path: int
+
+
+class State(NamedTuple):
+    """Of a ray: energy, random key, the facet it starts from, flags, hits so far."""
+
+    weight: int
+    key: int
+    facet: int
+    flags: int
+    hits: int
 
 
 @njit(cache=True)
@@ -78,23 +156,23 @@ def entry_cell(b2, cells):
     return min(int(b2 * cells), cells - 1)
 
 
-@njit(cache=True, nogil=True)
-def spawn(paths, seed, plain, directions, rays, starts, ways, by_entry):
-    """Start the paths numbered: parallel light, uniform over the disc, from everywhere."""
-    low, high = np.uint64(0xFFFFFFFF), np.uint64(32)
+@njit(**KERNEL)
+def spawn(task, rays, live, paths, counts):
+    """Start the paths numbered behind the first `live` rays: parallel light, uniform over the disc, from everywhere."""
+    seed, low, high = task.seed, np.uint64(0xFFFFFFFF), np.uint64(32)
     for i in range(len(paths)):
         path = paths[i]
-        if plain:
+        if task.plain:
             u0, u1 = unit(key_of(seed, path, 11)), unit(key_of(seed, path, 12))
             u2, u3 = unit(key_of(seed, path, 13)), unit(key_of(seed, path, 14))
         else:
             index = path // T.REPLICATES
             k = key_of(seed, path % T.REPLICATES, 7)
             k2 = mix(k + np.uint64(1))
-            u0 = sobol(index, 0, k & low, directions)
-            u1 = sobol(index, 1, k >> high, directions)
-            u2 = sobol(index, 2, k2 & low, directions)
-            u3 = sobol(index, 3, k2 >> high, directions)
+            u0 = sobol(index, 0, k & low, task.sobol)
+            u1 = sobol(index, 1, k >> high, task.sobol)
+            u2 = sobol(index, 2, k2 & low, task.sobol)
+            u3 = sobol(index, 3, k2 >> high, task.sobol)
         dz = 1.0 - 2.0 * u0
         across = math.sqrt(max(0.0, 1.0 - dz * dz))
         c, s = turn(u1)
@@ -104,21 +182,28 @@ def spawn(paths, seed, plain, directions, rays, starts, ways, by_entry):
         c, s = turn(u3)
         entry = step(step(step((0.0, 0.0, 0.0), radius * c, t), radius * s, b), -math.sqrt(1.0 - u2), d)
         side = P_POLARISED if key_of(seed, path, 2) & np.uint64(1) else 0
-        start(i, rays, starts, ways, entry, entry, d, entry, d, 0.0, T.UNIT, key_of(seed, path, 1), -1, side, 0, path)
-        if by_entry.shape[1] > 0:
-            by_entry[0, entry_cell(entry_b2(entry, triple(rays[i].d)), T.ENTRY)] += T.UNIT
+        ray = rays.now[live + i]
+        start(ray, entry, d, Past(entry, d, 0.0, path), State(T.UNIT, key_of(seed, path, 1), -1, side, 0))
+        ask(rays, live + i, entry, ray)
+        if counts.entry.shape[1] > 0:
+            counts.entry[0, entry_cell(entry_b2(entry, triple(ray.d)), T.ENTRY)] += T.UNIT
 
 
-@njit(cache=True, inline="always")
-def start(i, rays, starts, ways, p, shifted, d, entry, d_in, length, weight, key, facet, flags, hits, path):
-    """Write ray i from p along d, and for the ray engine from `shifted`."""
-    unit_length = 1.5 - 0.5 * dot(d, d)  # a step of Newton's: keeps rounding errors from piling up
-    ray = rays[i]
+@njit(forceinline=True, **KERNEL)
+def start(ray, p, d, past, state):
+    """Write a ray from p along d."""
+    d = renewed(d)
     for k in range(3):
-        ray.p[k], ray.d[k], ray.entry[k], ray.d_in[k] = p[k], d[k] * unit_length, entry[k], d_in[k]
-        starts[i, k], ways[i, k] = shifted[k], d[k] * unit_length
-    ray.length, ray.weight, ray.key, ray.path = length, weight, key, path
-    ray.facet, ray.flags, ray.hits = facet, flags, hits
+        ray.p[k], ray.d[k], ray.entry[k], ray.d_in[k] = p[k], d[k], past.entry[k], past.d_in[k]
+    ray.length, ray.path = past.length, past.path
+    ray.weight, ray.key, ray.facet, ray.flags, ray.hits = state.weight, state.key, state.facet, state.flags, state.hits
+
+
+@njit(forceinline=True, **KERNEL)
+def ask(rays, i, p, ray):
+    """Ask the ray engine for the facet that ray i meets, seen from p."""
+    for k in range(3):
+        rays.starts[i, k], rays.ways[i, k] = p[k], ray.d[k]
 
 
 @njit(cache=True)
@@ -174,11 +259,14 @@ def azimuth_from(p, d, out):
 
 
 @njit(cache=True)
-def keep(records, entry_records, c, weight, key, r, z, phi, length, p, d, out):
+def keep(counts, c, weight, key, offset, p, d, out):
     """Offer the record of light that enters at p along d and leaves along `out` to the reservoirs.
 
     Those of cell `c` of theta and of its cell of entry_b2: it stays if its key u / weight is among the smallest.
+    `offset` is r, z, phi_Delta and the path length.
     """
+    records, entry_records = counts.records, counts.entry_records
+    r, z, phi, length = offset
     share = weight / T.UNIT
     value = (1.0 - unit(key)) / share
     if records.shape[1] > 0 and value < records[c, -1, 0]:
@@ -202,12 +290,6 @@ def keep(records, entry_records, c, weight, key, r, z, phi, length, p, d, out):
 def rounded(x):
     """Return the nearest integer."""
     return np.int64(math.floor(x + 0.5))
-
-
-@njit(cache=True, inline="always")
-def row(block, i):
-    """Return the first three elements of a row."""
-    return block[i, 0], block[i, 1], block[i, 2]
 
 
 @njit(cache=True, inline="always")
@@ -243,29 +325,42 @@ def side_azimuth(entry, d_in, exit):
     return arc(dot(d_in, cross(side, offset)), dot(side, offset))
 
 
-@njit(cache=True, inline="always")
-def count_offset(cells, c, box, box_l, half, g, lb, boxed, weight, r, z, phi):
-    """Count one offset in the conditionals and, if `boxed`, in the joint distributions."""
-    rc = min(int(r * (T.R / 2.0)), T.R - 1)
-    zc = min(max(int((z + 1.0) * (T.Z / 3.0) + 1e-9), 0), T.Z - 1)  # z = 0, a reflection, must not fall on both sides
-    cells[c, T.AT_PHI + int(phi * (T.PHI / (2.0 * math.pi)) + (T.PHI + 0.5)) % T.PHI] += weight
-    cells[c, T.AT_R + rc] += weight
-    cells[c, T.AT_Z + zc] += weight
-    if boxed:
-        pb = int(phi * (BOX_PHI / (2.0 * math.pi)) + (BOX_PHI + 0.5)) % BOX_PHI
-        rb, zb = rc * BOX_R // T.R, zc * BOX_Z // T.Z
-        box[half, g, pb, rb, zb] += weight
-        box_l[half, g, lb, pb] += weight
-        box_l[half, g, lb, BOX_PHI + rb] += weight
-        box_l[half, g, lb, BOX_PHI + BOX_R + zb] += weight
+@njit(forceinline=True, **KERNEL)
+def offset_cells(r, z):
+    """Return the cells of r and of z."""
+    # z = 0, a reflection, must not fall on both sides
+    return min(int(r * (T.R / 2.0)), T.R - 1), min(max(int((z + 1.0) * (T.Z / 3.0) + 1e-9), 0), T.Z - 1)
 
 
-@njit(cache=True)
-def count_block(count, block, edges, counters):
+@njit(**KERNEL)
+def count_offset(counts, c, weight, offset):
+    """Count one offset in the conditionals of cell c of theta."""
+    r, z, phi, _ = offset
+    rc, zc = offset_cells(r, z)
+    counts.cells[c, T.AT_PHI + int(phi * (T.PHI / (2.0 * math.pi)) + (T.PHI + 0.5)) % T.PHI] += weight
+    counts.cells[c, T.AT_R + rc] += weight
+    counts.cells[c, T.AT_Z + zc] += weight
+
+
+@njit(**KERNEL)
+def count_joint(counts, half, g, weight, offset):
+    """Count one offset in the joint distributions of group g of theta."""
+    r, z, phi, length = offset
+    rc, zc = offset_cells(r, z)
+    lb = min(int(length * (BOX_L / T.BOX_LENGTH)), BOX_L - 1)
+    pb = int(phi * (BOX_PHI / (2.0 * math.pi)) + (BOX_PHI + 0.5)) % BOX_PHI
+    rb, zb = rc * BOX_R // T.R, zc * BOX_Z // T.Z
+    counts.box[half, g, pb, rb, zb] += weight
+    counts.box_l[half, g, lb, pb] += weight
+    counts.box_l[half, g, lb, BOX_PHI + rb] += weight
+    counts.box_l[half, g, lb, BOX_PHI + BOX_R + zb] += weight
+
+
+@njit(**KERNEL)
+def count_block(count, block, counts):
     """Count the light of a block's first `count` columns, as it is and walked backwards, which is as likely."""
-    left, notes, found = block
-    scalars, theta, cells, box, box_l, records, _, entry_records = counters
-    kept = records.shape[1] > 0 or entry_records.shape[1] > 0
+    left, notes, found, scalars = block.left, block.notes, block.found, counts.scalars
+    kept = counts.records.shape[1] > 0 or counts.entry_records.shape[1] > 0
     measure(count, left, found)
     for i in range(count):
         p, d, entry, d_in = column(left, 0, i), column(left, 3, i), column(left, 6, i), column(left, 9, i)
@@ -293,158 +388,189 @@ def count_block(count, block, edges, counters):
         scalars[replicate, T.MEAN_Z] += rounded(weight * 0.5 * (z + z_back))
         scalars[replicate, T.PATH_LENGTH] += energy_length
         scalars[replicate, T.OFFSET] += rounded(weight * math.sqrt(r * r + z * z))
-        theta[replicate, f] += weight
-        lc = length_cell(length, edges)
-        cells[c, T.AT_L + lc] += weight
-        cells[c, T.AT_L_SUM + lc] += energy_length
+        counts.theta[replicate, f] += weight
+        lc = length_cell(length, counts.edges)
+        counts.cells[c, T.AT_L + lc] += weight
+        counts.cells[c, T.AT_L_SUM + lc] += energy_length
         # an eighth of the paths tells the joint distributions well enough
         boxed = mix(np.uint64(path)) & np.uint64(7) == 0
-        half, lb = replicate & 1, min(int(length * (BOX_L / T.BOX_LENGTH)), BOX_L - 1)
         forth, back = weight, weight
         if weight < LIGHT:
             forth, back = (2 * weight, 0) if key & np.uint64(256) else (0, 2 * weight)
-        if forth > 0:
-            count_offset(cells, c, box, box_l, half, g, lb, boxed, forth, r, z, phi)
-        if back > 0:
-            count_offset(cells, c, box, box_l, half, g, lb, boxed, back, r_back, z_back, phi_back)
-        if kept and forth > 0:
-            once = mix(key + np.uint64(0x51))
-            keep(records, entry_records, c, forth, once, r, z, phi, length, entry, d_in, d)
-        if kept and back > 0:
-            again, exit = mix(key + np.uint64(0x52)), rim(p, d)
-            keep(records, entry_records, c, back, again, r_back, z_back, phi_back, length, exit, minus(d), minus(d_in))
+        for way in range(2):
+            share = forth if way == 0 else back
+            if share == 0:
+                continue
+            offset = (r, z, phi, length) if way == 0 else (r_back, z_back, phi_back, length)
+            count_offset(counts, c, share, offset)
+            if boxed:
+                count_joint(counts, replicate & 1, g, share, offset)
+            if kept and way == 0:
+                keep(counts, c, share, mix(key + np.uint64(0x51)), offset, entry, d_in, d)
+            elif kept:
+                keep(counts, c, share, mix(key + np.uint64(0x52)), offset, rim(p, d), minus(d), minus(d_in))
 
 
-@njit(cache=True, inline="always")
-def leave(i, left, notes, p, d, length, entry, d_in, weight, key, path):
+@njit(forceinline=True, **KERNEL)
+def leave(block, i, p, d, past, weight, key):
     """Note in column i light that leaves point p along d for good."""
+    left, notes = block.left, block.notes
     for k in range(3):
-        left[k, i], left[3 + k, i], left[6 + k, i], left[9 + k, i] = p[k], d[k], entry[k], d_in[k]
-    left[12, i], notes[0, i], notes[1, i], notes[2, i] = length, weight, path, np.int64(key)
+        left[k, i], left[3 + k, i], left[6 + k, i], left[9 + k, i] = p[k], d[k], past.entry[k], past.d_in[k]
+    left[12, i], notes[0, i], notes[1, i], notes[2, i] = past.length, weight, past.path, np.int64(key)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def advance(count, prims, sphere, planes, centroids, horizon, eta, polarisation, reflectance_scale,
-            split, fan_size, max_hits, edges, rays, next_rays, starts, ways, block, counters):  # fmt: skip
+@njit(**KERNEL)
+def advance(task, rays, block, counts, count, prims):
     """Take `count` rays, whose next facets are `prims`, through one hit each; return how many go on.
 
-    What goes on is packed into next_rays and, for the ray engine, starts and ways.
+    What goes on is packed into ``rays.then`` and, for the ray engine, starts and ways.
     """
-    scalars, by_entry, (left, notes, _) = counters[0], counters[6], block
     live, held = 0, 0
     for i in range(count):
-        if held > BLOCK - fan_size:
-            count_block(held, block, edges, counters)
+        if held > BLOCK - task.fan:
+            count_block(held, block, counts)
             held = 0
-        ray, facet = rays[i], prims[i]
-        p, d, entry, d_in = triple(ray.p), triple(ray.d), triple(ray.entry), triple(ray.d_in)
-        length, path, key, weight = ray.length, ray.path, ray.key, np.int64(ray.weight)
-        inside, met, side = (ray.flags & INSIDE) != 0, (ray.flags & MET) != 0, ray.flags & P_POLARISED
-        replicate = path % T.REPLICATES
-
-        if facet < 0 and not inside:
-            if met:
-                leave(held, left, notes, p, d, length, entry, d_in, weight, key, path)
-                held += 1
-            else:
-                scalars[replicate, T.UNSCATTERED] += weight
-                scalars[replicate, T.MISS_CHORD] += rounded(weight * -2.0 * dot(p, d))
-                if by_entry.shape[1] > 0:
-                    by_entry[1, entry_cell(entry_b2(p, d), T.ENTRY)] += weight
+        ray, facet = rays.now[i], prims[i]
+        if facet < 0 and ray.flags & INSIDE == 0:
+            held += outside(block, counts, held, ray)
             continue
-
-        # The hit, on the facet's plane (or the sphere), with its normal
-        lost = facet < 0
-        n, cosine, t = (0.0, 0.0, 0.0), 0.0, 0.0
-        if sphere:
-            t = -2.0 * dot(p, d) if inside else 0.0
-            n = step(p, t, d)
-            n = step((0.0, 0.0, 0.0), 1.0 / math.sqrt(dot(n, n)), n)
-            cosine = dot(n, d)
-        elif not lost:
-            n = row(planes, facet)
-            cosine = dot(n, d)
-            t = (planes[facet, 3] - dot(n, p)) / cosine
-        if lost or (cosine > 0.0) != inside or not (-10.0 * OFFSET <= t <= 2.5):
-            # A leak at an edge or a vertex: once more from nearer the middle of the facet it came from
-            if ray.facet < 0 or ray.flags & RETRIED:
-                scalars[replicate, T.LOST] += weight
-            else:
-                moved = step(p, RETRY, step(row(centroids, ray.facet), -1.0, p))
-                moved = step(moved, -OFFSET if inside else OFFSET, row(planes, ray.facet))
-                start(live, next_rays, starts, ways, p, moved, d, entry, d_in, length, weight, key,
-                      ray.facet, ray.flags | RETRIED, ray.hits, path)  # fmt: skip
-                live += 1
-            continue
-
-        t = max(t, 0.0)
-        p = n if sphere else step(p, t, d)
-        if inside:
-            length += t
-        hits = ray.hits + 1
-        if hits > max_hits:
-            scalars[replicate, T.TRUNCATED] += weight
-            continue
-
-        # Above the horizon of a facet light comes unobstructed: one point, several directions
-        low = horizon[facet]
-        fan = 1 if inside or met or -cosine <= low else fan_size
-        weight //= fan
-        full = 1.0 - low * low
-        u, turn_c, turn_s = 0.0, 1.0, 0.0
-        tangent, bitangent = d, d
-        if fan > 1:
-            tangent, bitangent = frame(n)
-            c, s = dot(d, tangent), dot(d, bitangent)
-            u = min(c * c + s * s, full)
-            around = math.sqrt(u)
-            turn_c, turn_s = (c / around, s / around) if around > 0.0 else (1.0, 0.0)
-        for k in range(fan):
-            if k > 0:
-                # Lambert's projection turned by the golden angle and shifted by 1 / fan: uniform again
-                u = u + full / fan if u + full / fan < full else u + full / fan - full
-                turn_c, turn_s = turn_c * GOLDEN_C - turn_s * GOLDEN_S, turn_s * GOLDEN_C + turn_c * GOLDEN_S
-                cosine = -math.sqrt(max(1.0 - u, 1e-300))
-                d = step(step(step((0.0, 0.0, 0.0), math.sqrt(u) * turn_c, tangent), math.sqrt(u) * turn_s, bitangent),
-                         cosine, n)  # fmt: skip
-                entry, d_in = rim(p, minus(d)), d
-
-            # Reflection and refraction; one of the two goes on outside (out), the other inside (into)
-            ratio = 1.0 / eta if inside else eta
-            cos_i = min(abs(cosine), 1.0)
-            reflectance, cos_t = fresnel(cos_i, ratio, polarisation if polarisation < 3 else (2 if side else 1))
-            total = reflectance >= 1.0
-            if not total:
-                reflectance = min(reflectance * reflectance_scale, 1.0)
-            mirrored = step(d, -2.0 * cosine, n)
-            bent = d
-            if ratio != 1.0:
-                bend = cos_t - cos_i / ratio
-                bent = step(step((0.0, 0.0, 0.0), 1.0 / ratio, d), bend if cosine > 0.0 else -bend, n)
-            out, into = (bent, mirrored) if inside else (mirrored, bent)
-            mirrored_weight = weight if total else rounded(weight * reflectance)
-            out_weight = weight - mirrored_weight if inside else mirrored_weight
-            key = mix(key + GOLDEN)
-            lighter = min(out_weight, weight - out_weight)
-            least = min(split, weight)
-            free = dot(out, n) > low or low == 0.0
-            if 0 < lighter < least and not (free and weight > split and out_weight == lighter):
-                kept = least if unit(key) * least < lighter else 0
-                out_weight = kept if lighter == out_weight else weight - kept
-            if out_weight > 0:
-                if free:
-                    leave(held, left, notes, p, out, length, entry, d_in, out_weight, key, path)
-                    held += 1
-                else:
-                    start(live, next_rays, starts, ways, p, step(p, OFFSET, n), out, entry, d_in, length,
-                          out_weight, mix(key ^ OTHER), facet, MET | side, hits, path)  # fmt: skip
-                    live += 1
-            if out_weight < weight:
-                start(live, next_rays, starts, ways, p, step(p, -OFFSET, n), into, entry, d_in, length,
-                      weight - out_weight, key, facet, MET | INSIDE | side, hits, path)  # fmt: skip
-                live += 1
-    count_block(held, block, edges, counters)
+        p, n, cosine, t = hit(task, ray, facet)
+        if not sound(cosine, t, ray.flags & INSIDE != 0):
+            live += again(task, rays, counts, live, ray)
+        elif ray.hits >= task.max_bounces:
+            counts.scalars[ray.path % T.REPLICATES, T.TRUNCATED] += ray.weight
+        else:
+            live, held = light(task, rays, block, (live, held), ray, facet, (p, n, cosine, t))
+    count_block(held, block, counts)
     return live
+
+
+@njit(**KERNEL)
+def outside(block, counts, held, ray):
+    """Count a ray that missed the grain, or note that it leaves it; return how many were noted."""
+    p, d, weight = triple(ray.p), triple(ray.d), np.int64(ray.weight)
+    if ray.flags & MET:
+        leave(block, held, p, d, Past(triple(ray.entry), triple(ray.d_in), ray.length, ray.path), weight, ray.key)
+        return 1
+    replicate = ray.path % T.REPLICATES
+    counts.scalars[replicate, T.UNSCATTERED] += weight
+    counts.scalars[replicate, T.MISS_CHORD] += rounded(weight * -2.0 * dot(p, d))
+    if counts.entry.shape[1] > 0:
+        counts.entry[1, entry_cell(entry_b2(p, d), T.ENTRY)] += weight
+    return 0
+
+
+@njit(forceinline=True, **KERNEL)
+def hit(task, ray, facet):
+    """Return where a ray meets a facet or the sphere, the normal there, its cosine with the ray, and the distance,
+    which is infinite where it meets nothing."""
+    p, d = triple(ray.p), triple(ray.d)
+    if task.sphere:
+        t = -2.0 * dot(p, d) if ray.flags & INSIDE else 0.0
+        n = step(p, t, d)
+        n = step((0.0, 0.0, 0.0), 1.0 / math.sqrt(dot(n, n)), n)
+        return n, n, dot(n, d), t
+    if facet < 0:
+        return p, d, 0.0, math.inf
+    n, cosine, t = on_plane(task.planes[facet], p, d)
+    return step(p, max(t, 0.0), d), n, cosine, t
+
+
+@njit(**KERNEL)
+def again(task, rays, counts, live, ray):
+    """Send a ray that leaked at an edge or a vertex off once more, from nearer the middle of the facet it came from;
+    return how many go on."""
+    if ray.facet < 0 or ray.flags & RETRIED:
+        counts.scalars[ray.path % T.REPLICATES, T.LOST] += ray.weight
+        return 0
+    p, past = triple(ray.p), Past(triple(ray.entry), triple(ray.d_in), ray.length, ray.path)
+    moved = nearer(task.centroids[ray.facet], p)
+    moved = step(moved, -OFFSET if ray.flags & INSIDE else OFFSET, triple(task.planes[ray.facet]))
+    start(rays.then[live], p, triple(ray.d), past,
+          State(ray.weight, ray.key, ray.facet, ray.flags | RETRIED, ray.hits))  # fmt: skip
+    ask(rays, live, moved, rays.then[live])
+    return 1
+
+
+@njit(forceinline=True, **KERNEL)
+def light(task, rays, block, ends, ray, facet, met):
+    """Split the light of a ray where it meets a facet; return the new ends of the rays that go on and of the block.
+
+    `met` is what `hit` found. Light that comes from above the horizon of the facet comes unobstructed: one point is
+    lit from several directions.
+    """
+    (live, held), (p, n, cosine, t) = ends, met
+    inside, side, key = ray.flags & INSIDE != 0, ray.flags & P_POLARISED, ray.key
+    d, entry, d_in = triple(ray.d), triple(ray.entry), triple(ray.d_in)
+    length = ray.length + max(t, 0.0) if inside else ray.length
+    ratio = 1.0 / task.eta if inside else task.eta
+    polarisation = task.polarisation
+    if polarisation == KEPT_APART:
+        polarisation = P if side else S
+    low = task.horizon[facet]
+    fan = 1 if inside or ray.flags & MET or -cosine <= low else task.fan
+    weight, split, full = ray.weight // fan, task.split, 1.0 - low * low
+    lit, axes = (0.0, 1.0, 0.0), (d, d)
+    if fan > 1:
+        axes = frame(n)
+        lit = projected(dot(d, axes[0]), dot(d, axes[1]), full)
+    for k in range(fan):
+        if k > 0:
+            lit = next_of_fan(lit, full, fan)
+            around, cosine = math.sqrt(lit[0]), -math.sqrt(max(1.0 - lit[0], 1e-300))
+            d = step(step(step((0.0, 0.0, 0.0), around * lit[1], axes[0]), around * lit[2], axes[1]), cosine, n)
+            entry, d_in = rim(p, minus(d)), d
+        # Of reflection and refraction one goes on outside (out), the other inside (into)
+        reflectance, mirrored, refracted = parted(d, n, cosine, ratio, polarisation)
+        out, into = (refracted, mirrored) if inside else (mirrored, refracted)
+        mirrored_weight = weight
+        if reflectance < 1.0:
+            mirrored_weight = rounded(weight * min(reflectance * task.reflectance_scale, 1.0))
+        out_weight = weight - mirrored_weight if inside else mirrored_weight
+        key = mix(key + GOLDEN)
+        free = dot(out, n) > low or low == 0.0
+        if not (free and weight > split and 2 * out_weight <= weight):
+            out_weight = raised(out_weight, weight, min(split, weight), key)
+        past, hits = Past(entry, d_in, length, ray.path), ray.hits + 1
+        if out_weight > 0 and free:
+            leave(block, held, p, out, past, out_weight, key)
+            held += 1
+        elif out_weight > 0:
+            start(rays.then[live], p, out, past, State(out_weight, mix(key ^ OTHER), facet, MET | side, hits))
+            ask(rays, live, step(p, OFFSET, n), rays.then[live])
+            live += 1
+        if out_weight < weight:
+            start(rays.then[live], p, into, past, State(weight - out_weight, key, facet, MET | INSIDE | side, hits))
+            ask(rays, live, step(p, -OFFSET, n), rays.then[live])
+            live += 1
+    return live, held
+
+
+@njit(forceinline=True, **KERNEL)
+def projected(x, y, full):
+    """Return a direction of components x and y in Lambert's projection: squared radius, `full` at most, and azimuth."""
+    u = min(x * x + y * y, full)
+    around = math.sqrt(u)
+    return (u, x / around, y / around) if around > 0.0 else (u, 1.0, 0.0)
+
+
+@njit(forceinline=True, **KERNEL)
+def next_of_fan(lit, full, fan):
+    """Turn a projected direction by the golden angle and shift it by 1 / fan of the disc: uniform again."""
+    u, c, s = lit
+    u = u + full / fan if u + full / fan < full else u + full / fan - full
+    return u, c * GOLDEN_C - s * GOLDEN_S, s * GOLDEN_C + c * GOLDEN_S
+
+
+@njit(forceinline=True, **KERNEL)
+def raised(part, whole, least, key):
+    """Return the weight of a part, after the lighter of it and the rest was raised to the least, or dropped."""
+    lighter = min(part, whole - part)
+    if not 0 < lighter < least:
+        return part
+    kept = least if unit(key) * least < lighter else 0
+    return kept if lighter == part else whole - kept
 
 
 def in_order(first: int, last: int) -> np.ndarray:
@@ -511,60 +637,56 @@ class Tracer:
     log: Callable[[np.ndarray, np.ndarray], None] | None = None
 
     def __post_init__(self) -> None:
+        planes, centroids, horizon, share = surface_of(self.grain, self.plain)
         self._sphere = self.grain.kind == "sphere"
-        self._polarisation = {"un": UNPOLARISED, "sp": 3}[self.fresnel]
-        self._planes, self._centroids, self._horizon, share = surface_of(self.grain, self.plain)
         if not self._sphere:
             self._scene = embree_scene(self.grain)
         self._fan = 1 if self.plain else FAN if share > OPEN else FAN // 2
-        self._split = T.UNIT if self.plain else int(SPLIT * T.UNIT / self._fan)
-        self._block = np.empty((13, BLOCK)), np.empty((3, BLOCK), dtype=np.int64), np.empty((8, BLOCK))
-        self._rays, self._next = np.empty(0, RAY), np.empty(0, RAY)
-        self._starts, self._ways = np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)
-        self._always = np.empty(0, np.int32)
+        self._task = Handle(
+            Task(
+                self._sphere, planes, centroids, horizon, float(self.eta),
+                {"un": UNPOLARISED, "sp": KEPT_APART}[self.fresnel], float(self.reflectance_scale),
+                T.UNIT if self.plain else int(SPLIT * T.UNIT / self._fan), self._fan, self.max_bounces, self.seed,
+                self.plain, SOBOL,
+            )
+        )  # fmt: skip
+        self._block = Handle(Block(np.empty((13, BLOCK)), np.empty((3, BLOCK), np.int64), np.empty((8, BLOCK))))
+        self._always = np.zeros(0, np.int32)
+        self._rays: list[Handle] = []
         self._reserve((1 + self._fan) * self.slots)
 
     def _reserve(self, capacity: int) -> None:
         """Make room for that many rays, keeping those under way."""
-        old = len(self._rays)
+        old = len(self._always)
         if capacity <= old:
             return
-        kept = self._rays, self._starts, self._ways
-        self._rays, self._next = np.empty(capacity, RAY), np.empty(capacity, RAY)
-        self._starts, self._ways = np.empty((capacity, 3), np.float32), np.empty((capacity, 3), np.float32)
-        self._always = np.zeros(capacity, dtype=np.int32)
-        for new, mine in zip((self._rays, self._starts, self._ways), kept, strict=True):
-            new[:old] = mine
+        now, then = np.empty(capacity, RAY), np.empty(capacity, RAY)
+        starts, ways = np.empty((capacity, 3), np.float32), np.empty((capacity, 3), np.float32)
+        if old:
+            mine = self._rays[0].values
+            now[:old], starts[:old], ways[:old] = mine.now, mine.starts, mine.ways
+        self._rays = [Handle(Rays(now, then, starts, ways)), Handle(Rays(then, now, starts, ways))]
+        self._always = np.zeros(capacity, np.int32)
 
     def trace(self, paths: np.ndarray, tally: Tally, stop: Event | None = None) -> int:
         """Trace the paths of the numbers given, (n,) int64, into `tally`; return the number of rays that took.
 
         Once `stop` is set the counts are worthless.
         """
-        counters = (
-            tally.scalars, tally.theta, tally.cells, tally.box, tally.box_l, tally.records, tally.entry,
-            tally.entry_records,
-        )  # fmt: skip
+        counts = Handle(Counts(**tally.arrays(), edges=T.L_EDGES))
         first, live, total = 0, 0, 0
         tally.scalars[:, T.LAUNCHED] += T.UNIT * np.bincount(paths % T.REPLICATES, minlength=T.REPLICATES)
         while (live or first < len(paths)) and not (stop is not None and stop.is_set()):
             if live < self.slots // 2 and first < len(paths):
                 fresh = paths[first : first + self.slots - live]
-                spawn(
-                    fresh, self.seed, self.plain, SOBOL, self._rays[live:], self._starts[live:], self._ways[live:],
-                    tally.entry,
-                )  # fmt: skip
+                spawn(self._task, self._rays[0], live, fresh, counts)
                 first, live = first + len(fresh), live + len(fresh)
             self._reserve((1 + self._fan) * live)
-            starts, ways = self._starts[:live], self._ways[:live]
+            starts, ways = self._rays[0].values.starts[:live], self._rays[0].values.ways[:live]
             prims = self._always[:live] if self._sphere else self._scene.run(starts, ways)
             if self.log is not None:
                 self.log(starts, ways)
             total += live
-            live = advance(
-                live, prims, self._sphere, self._planes, self._centroids, self._horizon, self.eta, self._polarisation,
-                self.reflectance_scale, self._split, self._fan, self.max_bounces, T.L_EDGES, self._rays, self._next,
-                self._starts, self._ways, self._block, counters,
-            )  # fmt: skip
-            self._rays, self._next = self._next, self._rays
+            live = advance(self._task, self._rays[0], self._block, counts, live, prims)
+            self._rays.reverse()
         return total

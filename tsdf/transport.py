@@ -36,7 +36,7 @@ from tsdf.sampler import (
     turned,
 )
 from tsdf.sampling import GOLDEN, key_of, mix, unit
-from tsdf.vectors import KERNEL, cross, dot, frame, minus, step, triple
+from tsdf.vectors import KERNEL, cross, dot, frame, minus, renewed, step, triple
 from tsdf.walker import (
     ASKED,
     CLEAR,
@@ -68,7 +68,6 @@ from tsdf.walker import (
     full,
     halves,
     lives,
-    renewed,
     write,
 )  # fmt: skip
 

@@ -48,3 +48,10 @@ def frame(n):
     a = -1.0 / (sign + z)
     b = x * y * a
     return (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+
+
+@njit(forceinline=True, **KERNEL)
+def renewed(d):
+    """Return a nearly unit vector with unit length, by a step of Newton's: keeps rounding errors from piling up."""
+    half = 1.5 - 0.5 * dot(d, d)
+    return d[0] * half, d[1] * half, d[2] * half

@@ -12,7 +12,7 @@ from tsdf.compiled import njit
 from tsdf.geometry import NONE
 from tsdf.levels import Traits
 from tsdf.sampling import mix, unit
-from tsdf.vectors import KERNEL, dot
+from tsdf.vectors import KERNEL
 
 WALKER = np.dtype(
     [("p", "3f8"), ("d", "3f8"), ("q", "3f8"), ("e", "3f8"), ("t", "3f8"), ("colour", "3f8"), ("weight", "f8"),
@@ -153,13 +153,6 @@ def find(world, batch, w, amounts, light):
     left = absorbed(world.absorption, amounts)
     for k in range(3):
         batch.radiance[w.sample, k] += w.weight * w.colour[k] * light[k] * left[k]
-
-
-@njit(forceinline=True, **KERNEL)
-def renewed(d):
-    """Return a nearly unit vector with unit length: keeps rounding errors from piling up."""
-    half = 1.5 - 0.5 * dot(d, d)
-    return d[0] * half, d[1] * half, d[2] * half
 
 
 @njit(forceinline=True, **KERNEL)
