@@ -92,3 +92,21 @@ def test_a_numba_without_the_private_option(monkeypatch: pytest.MonkeyPatch) -> 
         return 2 * x
 
     assert twice(3) == 6
+
+
+def test_numbers_written_down_are_numbers() -> None:
+    """A kernel that others call with 0, 1 and a count from 0, alone or in a tuple, is compiled once."""
+
+    @njit()
+    def inner(pair, i):  # type: ignore[no-untyped-def]
+        return pair[0] + i
+
+    @njit()
+    def outer(n):  # type: ignore[no-untyped-def]
+        total = 0
+        for i in range(n):
+            total += inner((total, 1), i) + inner((0, 2), 0) + inner((1, 3), 1)
+        return total
+
+    assert outer(2) == 7
+    assert len(inner.signatures) == 1
