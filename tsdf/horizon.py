@@ -1,20 +1,35 @@
 """What stands before a facet: from how low an elevation on light comes and goes unobstructed."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from tsdf.compiled import njit
-from tsdf.vectors import cross, dot, step, triple
+from tsdf.handle import Handle
+from tsdf.vectors import KERNEL, cross, dot, step, triple
 
 LEAF = 16  # vertices in the smallest group of the search for what stands before a plane
 FREQUENCY = 4  # steps along an edge of the octahedron whose grid of directions bounds groups of vertices
 CHUNK = 65536  # facets at a time
+GROUP = 16  # facets, one after the other in the mesh, that are passed over together where they cannot matter
 UNKNOWN = 2.0  # horizon of a facet of which nothing is promised: no sine exceeds it
 
 
+class Facets(NamedTuple):
+    """Facets (m,) of a grain: vertices (m, 3) and their places (m, 3, 3), normals and centroids (m, 3), distance of the
+    farthest corner from the centroid, and of vertices (n,) the sine of their sharpest corner."""
+
+    faces: np.ndarray
+    corners: np.ndarray
+    normals: np.ndarray
+    centroids: np.ndarray
+    radii: np.ndarray
+    corner_sines: np.ndarray
+
+
 @njit(cache=True)
-def _gap(i, j, corners, axis):
+def _gap(corners, i, j, axis):
     """Return how far triangle j lies beyond triangle i along an axis of unit length: no point of them is nearer."""
     low, high = math.inf, -math.inf
     for k in range(3):
@@ -23,47 +38,79 @@ def _gap(i, j, corners, axis):
     return low - high
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _rise(obstructed, faces, corners, normals, centroids, radii, corner_sines, horizon):
-    """Write into `horizon` a bound on the sine of the elevation of the grain over the facets listed."""
+@njit(**KERNEL)
+def _groups(facets, spheres):
+    """Write centre and radius of a sphere around each `GROUP` of facets into `spheres` (groups, 4)."""
+    for g in range(len(spheres)):
+        members = range(g * GROUP, min((g + 1) * GROUP, len(facets.faces)))
+        for j in members:
+            for k in range(3):
+                spheres[g, k] += facets.centroids[j, k] / len(members)
+        for j in members:
+            off = step(triple(facets.centroids[j]), -1.0, triple(spheres[g]))
+            spheres[g, 3] = max(spheres[g, 3], math.sqrt(dot(off, off)) + facets.radii[j] + 1e-12)
+
+
+@njit(**KERNEL)
+def _rise(facets, obstructed, spheres, horizon):
+    """Write into `horizon` a bound on the sine of the elevation of the grain over the facets listed.
+
+    It is the largest that any other facet demands, in whatever order they are asked: first those that are near in the
+    mesh, which lets most groups of others be passed over.
+    """
     for i in obstructed:
-        top, n = 0.0, triple(normals[i])
-        for j in range(len(faces)):
-            apart = step(triple(centroids[j]), -1.0, triple(centroids[i]))
-            if dot(n, apart) + radii[j] <= 1e-9 or j == i:
+        top, n, centroid, groups = 0.0, triple(facets.normals[i]), triple(facets.centroids[i]), len(spheres)
+        for k in range(groups):
+            g = (i // GROUP + k) % groups
+            apart, radius = step(triple(spheres[g]), -1.0, centroid), spheres[g, 3]
+            above = dot(n, apart) + radius
+            if above <= 1e-9 or above <= top * (math.sqrt(dot(apart, apart)) - radius - facets.radii[i]):
                 continue
-            above = -math.inf
-            for k in range(3):
-                above = max(above, dot(n, step(triple(corners[j, k]), -1.0, triple(corners[i, 0]))))
-            if above <= 1e-9:
-                continue
-            shared, sharp = 0, 1.0
-            for k in range(3):
-                for m in range(3):
-                    if faces[i, k] == faces[j, m]:
-                        shared += 1
-                        sharp = min(sharp, corner_sines[faces[i, k]])
-            if shared > 0:  # across an edge as steep as the neighbour; around a corner, perhaps seen from the side
-                facing = dot(n, triple(normals[j]))
-                tilt = math.sqrt(max(0.0, 1.0 - facing * facing))
-                rise = (tilt if shared == 2 else tilt / sharp) if facing > 0.0 else 1.0
-            else:
-                distance = math.sqrt(dot(apart, apart))
-                gap = distance - radii[i] - radii[j]
-                if above > top * gap and distance > 0.0:  # it matters: look closer, along the centres and off each side
-                    gap = max(gap, _gap(i, j, corners, step((0.0, 0.0, 0.0), 1.0 / distance, apart)))
-                    for k in range(3):
-                        along = step(triple(corners[i, (k + 1) % 3]), -1.0, triple(corners[i, k]))
-                        off = cross(along, n)
-                        gap = max(gap, _gap(i, j, corners, step((0.0, 0.0, 0.0), 1.0 / math.sqrt(dot(off, off)), off)))
-                        along = step(triple(corners[j, (k + 1) % 3]), -1.0, triple(corners[j, k]))
-                        off = cross(triple(normals[j]), along)
-                        gap = max(gap, _gap(i, j, corners, step((0.0, 0.0, 0.0), 1.0 / math.sqrt(dot(off, off)), off)))
-                rise = above / gap if gap > above else 1.0
-            top = max(top, rise)
+            for j in range(g * GROUP, min((g + 1) * GROUP, len(facets.faces))):
+                top = max(top, _demand(facets, i, j, top))
+                if top >= 1.0:
+                    break
             if top >= 1.0:
                 break
         horizon[i] = min(top, 1.0)
+
+
+@njit(**KERNEL)
+def _demand(facets, i, j, top):
+    """Return a bound on the sine of the elevation of facet j over facet i, a coarse one where it is below `top`."""
+    faces, corners, normals, radii = facets.faces, facets.corners, facets.normals, facets.radii
+    n, apart = triple(normals[i]), step(triple(facets.centroids[j]), -1.0, triple(facets.centroids[i]))
+    if dot(n, apart) + radii[j] <= 1e-9 or j == i:
+        return 0.0
+    above = -math.inf
+    for k in range(3):
+        above = max(above, dot(n, step(triple(corners[j, k]), -1.0, triple(corners[i, 0]))))
+    if above <= 1e-9:
+        return 0.0
+    shared, sharp = 0, 1.0
+    for k in range(3):
+        for m in range(3):
+            if faces[i, k] == faces[j, m]:
+                shared += 1
+                sharp = min(sharp, facets.corner_sines[faces[i, k]])
+    if shared > 0:  # across an edge as steep as the neighbour; around a corner, perhaps seen from the side
+        facing = dot(n, triple(normals[j]))
+        tilt = math.sqrt(max(0.0, 1.0 - facing * facing))
+        return (tilt if shared == 2 else tilt / sharp) if facing > 0.0 else 1.0
+    distance = math.sqrt(dot(apart, apart))
+    gap = distance - radii[i] - radii[j]
+    if above > top * gap and distance > 0.0:  # it matters: look closer, along the centres and off each side
+        gap = max(gap, _gap(corners, i, j, step((0.0, 0.0, 0.0), 1.0 / distance, apart)))
+        for k in range(3):
+            if above <= top * gap:
+                break
+            along = step(triple(corners[i, (k + 1) % 3]), -1.0, triple(corners[i, k]))
+            off = cross(along, n)
+            gap = max(gap, _gap(corners, i, j, step((0.0, 0.0, 0.0), 1.0 / math.sqrt(dot(off, off)), off)))
+            along = step(triple(corners[j, (k + 1) % 3]), -1.0, triple(corners[j, k]))
+            off = cross(triple(normals[j]), along)
+            gap = max(gap, _gap(corners, i, j, step((0.0, 0.0, 0.0), 1.0 / math.sqrt(dot(off, off)), off)))
+    return above / gap if gap > above else 1.0
 
 
 def _nodes():
@@ -205,7 +252,10 @@ def horizon_of(vertices: np.ndarray, faces: np.ndarray, planes: np.ndarray) -> n
         sines = np.linalg.norm(np.cross(sides, np.roll(sides, 1, axis=1)), axis=2)
         corner_sines = np.ones(len(vertices))
         np.minimum.at(corner_sines, faces.ravel(), sines.ravel())
-        normals = np.ascontiguousarray(planes[:, :3])
-        _rise(obstructed, faces, corners, normals, centroids, radii, np.maximum(corner_sines, 1e-9), horizon)
+        parts = faces, corners, planes[:, :3], centroids, radii, np.maximum(corner_sines, 1e-9)
+        facets = Handle(Facets(*map(np.ascontiguousarray, parts)))
+        spheres = np.zeros((-(-len(faces) // GROUP), 4))
+        _groups(facets, spheres)
+        _rise(facets, obstructed, spheres, horizon)
     horizon[horizon >= 1.0] = UNKNOWN
     return horizon
