@@ -563,8 +563,9 @@ def test_means_lie_in_their_cells(tmp_path: Path) -> None:
     """A part of 5 units of energy alone in a cell of path length: its rounded moment puts the mean beside the cell."""
     tally = Tally()
     rest = T.UNIT - 5
-    tally.scalars[:, T.LAUNCHED] = tally.scalars[:, T.SCATTERED] = T.UNIT
-    tally.theta[:, 0] = T.UNIT
+    tally.scalars[:, [T.LAUNCHED, T.SCATTERED, T.COS_THETA]] = T.UNIT
+    tally.scalars[:, T.MEAN_Z] = -T.UNIT
+    tally.theta[:, 0] = T.UNIT  # straight on, from the first cells of r and z
     tally.cells[0, [T.AT_PHI, T.AT_R, T.AT_Z]] = 2 * T.UNIT * T.REPLICATES
     for length, energy in ((0.0, rest * T.REPLICATES), (0.5 / 16, 5), (1.45, 5), (2.05, 5), (1e6, 5)):
         cell = np.searchsorted(T.L_EDGES, length, side="right") - 1 if length else 0
