@@ -28,6 +28,7 @@ HEAVY = ("tsdf-accuracy", "tsdf-build", "tsdf-compare", "tsdf-packing", "tsdf-re
 silent = False  # standard output was closed when the process began
 _name = ""  # of the command; none before `answer`
 _first: int | None = None  # the signal that came first
+_since = 0.0  # [s] and when
 _meaning: Callable[[], str | None] = str  # see `interruptible`
 _raises = False
 
@@ -80,29 +81,30 @@ def interrupt_status() -> int:
 
 
 def _handle(number: int, _: object) -> None:
-    """Run in the main thread, after the other thread has been told."""
-    global _raises
+    """Run in the main thread, before or after the other thread has been told."""
+    global _raises, _first, _since
     if _raises and _meaning() is None:
         _raises = False
+        if _first is None:
+            _first, _since = number, time.monotonic()
         raise KeyboardInterrupt
 
 
 def _listen(reading: int) -> None:
-    global _first
-    since = 0.0
+    global _first, _since
     while data := os.read(reading, 1):
         number = data[0]
         if number not in SIGNALS:
             continue
         if _first is None:
-            _first, since = number, time.monotonic()
+            _first, _since = number, time.monotonic()
             try:
                 said = _meaning()
             except Exception:  # it was asked in the middle of something
                 said = ""
             if said is not None:
                 _end(number, said)
-        elif time.monotonic() - since > AGAIN_S:
+        elif time.monotonic() - _since > AGAIN_S:
             _end(number, "at once: what was not written yet is lost")
 
 
