@@ -249,6 +249,11 @@ def main(
         return 0
 
     build = scatterometer.Build.start(shape, optics, effort)
+    if resume and not part_file.exists():
+        if max_seconds == 0.0:
+            raise TSDFError(f"{plain(part_file)} is not there: there are no paths to make a table of")
+        if not quiet:
+            click.echo(f"note: {plain(part_file)} is not there: the build begins anew", err=True)
     if resume and part_file.exists():
         build.take(scatterometer.Build.load(part_file), plain(part_file))
         if not quiet and build.paths > (paths or build.paths):

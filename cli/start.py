@@ -27,6 +27,7 @@ HEAVY = ("tsdf-accuracy", "tsdf-build", "tsdf-compare", "tsdf-packing", "tsdf-re
 
 silent = False  # standard output was closed when the process began
 _name = ""  # of the command; none before `answer`
+_error = 2  # standard error as it was then, whatever becomes of its number
 _first: int | None = None  # the signal that came first
 _since = 0.0  # [s] and when
 _meaning: Callable[[], str | None] = str  # see `interruptible`
@@ -35,11 +36,12 @@ _raises = False
 
 def answer(name: str) -> None:
     """Answer SIGINT and SIGTERM from here on, in the name of a command."""
-    global _name
+    global _name, _error
     if _name or threading.current_thread() is not threading.main_thread():
         return
     _name = name
     _open_streams()
+    _error = os.dup(2)
     _check_memory()
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
@@ -119,8 +121,8 @@ def _end(number: int, said: str) -> None:
 
         text = f"{_name}: error: interrupted{': ' * bool(said)}{said}\n"
         line = ("\n" * os.isatty(2) + text).encode(errors="backslashreplace")  # after ^C and a bar
-        if select.select([], [2], [], SAVING_S)[1]:
-            os.write(2, line)
+        if select.select([], [_error], [], SAVING_S)[1]:
+            os.write(_error, line)
     os._exit(128 + number)
 
 

@@ -559,6 +559,18 @@ def test_records_by_entry_keep_the_means_of_all_paths():
 # ------------------------------------------------------------------------------------------ nothing is lost
 
 
+def test_a_target_that_is_met_is_met_when_resumed(octahedron: Grain, tmp_path: Path) -> None:
+    """A build that was stopped after its target was met, before its table was made, asks for no more paths."""
+    part = tmp_path / "x.part"
+    build = Build.start(octahedron, Optics(1.31), Effort(target_error=0.05))
+    build.run(octahedron, 2, part_file=part)
+    again = Build.start(octahedron, Optics(1.31), Effort(target_error=0.05))
+    again.take(Build.load(part), "x.part")
+    again.run(octahedron, 1, part_file=part)
+    assert again.paths == build.paths
+    assert again.table().header == build.table().header
+
+
 def test_means_lie_in_their_cells(tmp_path: Path) -> None:
     """A part of 5 units of energy alone in a cell of path length: its rounded moment puts the mean beside the cell."""
     tally = Tally()

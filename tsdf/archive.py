@@ -67,7 +67,7 @@ def read(path: str | os.PathLike[str], limit: int) -> dict[str, np.ndarray]:
                 if member.compress_type != zipfile.ZIP_STORED or member.file_size > limit or name in arrays:
                     raise ValueError(name)
                 arrays[name] = _array(members.read(member))
-    except OSError:
+    except (OSError, MemoryError):
         raise
     except Exception as error:  # whatever a zip reader makes of a damaged file
         raise ValueError(str(error)) from error

@@ -70,9 +70,12 @@ def imported(name: str) -> frozenset[str]:
 
 @cache
 def stamp(name: str) -> str:
-    """Return the SHA-256 of the text of a module and of all it imports of the package, in hexadecimal."""
+    """Return the SHA-256 of the text of a module and of all it imports of the package, in hexadecimal.
+
+    How kernels read handles and are compiled is part of all of them.
+    """
     digest = hashlib.sha256()
-    for one in sorted(imported(name)):
+    for one in sorted(imported(name) | imported("compiled") | imported("handle")):
         digest.update(hashlib.sha256((PACKAGE / f"{one}.py").read_bytes()).digest())
     return digest.hexdigest()
 

@@ -4,6 +4,7 @@ Each thread has a tracer of its own and a tally for each of two rounds, so nobod
 shared out does not show in the sums.
 """
 
+import contextlib
 import threading
 import time
 from collections.abc import Iterable
@@ -108,11 +109,13 @@ class Crew:
     def dismiss(self, rounds: Iterable[Round], patience: float) -> list[Round]:
         """Start no more pieces of `rounds`, wait so many seconds for those under way, and return what is whole."""
         rounds = list(rounds)
-        running = [piece for under_way in rounds for piece in under_way.pieces if not piece.cancel()]
+        pieces = [piece for one in rounds for piece in one.pieces]
+        running = [piece for piece in reversed(pieces) if not piece.cancel()]  # the last first: no gaps are left
         deadline = time.monotonic() + patience
         for piece in running:
-            try:
+            with contextlib.suppress(TimeoutError):
                 piece.exception(max(0.0, deadline - time.monotonic()))
-            except TimeoutError:
-                self._stop.set()  # what it has counted is worthless
-        return [one for one in rounds if all(piece.done() for piece in one.pieces)] if not self._stop.is_set() else []
+        whole = [one for one in rounds if all(piece.done() for piece in one.pieces)]
+        if len(whole) < len(rounds):
+            self._stop.set()  # what the others have counted is worthless
+        return whole

@@ -2,8 +2,9 @@
 
 `columns_of` is where fine cells become the columns of a table; `traced_table` makes a `Table` of them, as
 `exact.exact_table` does without counts. Everything is a function of its arguments alone, so equal counts give equal
-bytes: on any processor and with any number of threads, for sums have a fixed order (`product`; numpy's own do, those of
-BLAS and LAPACK do not), and functions whose last digits depend on vector instructions are those of `math` (`each`).
+bytes with any number of threads: sums have a fixed order (`product`; numpy's own do, those of BLAS and LAPACK do not),
+and functions whose last digits depend on numpy's vector instructions are those of `math` (`each`). Those are the C
+library's, whose last digits differ on processors without fused multiply-add: of standard errors, not of pixels.
 """
 
 import math

@@ -92,13 +92,15 @@ def sources(path: Path) -> list[Path]:
         if one in found:
             continue
         found[one] = None
-        if pattern is None or not one.is_file():
-            continue
-        with contextlib.suppress(OSError), open(one, "rb") as file:
-            for name in map(os.fsdecode, re.findall(pattern, file.read(MOST_TEXT))):
-                plainly = name.strip().replace("\\/", "/")
-                spellings = {plainly, unquote(plainly), plainly.split()[-1] if plainly else ""} - {""}
-                waiting += [one.parent / spelling for spelling in spellings if "\0" not in spelling]
+        text = b""
+        with contextlib.suppress(OSError):  # of a name that is too long, too
+            if pattern is not None and one.is_file():
+                with open(one, "rb") as file:
+                    text = file.read(MOST_TEXT)
+        for name in map(os.fsdecode, re.findall(pattern or b"$^", text)):
+            plainly = name.strip().replace("\\/", "/")
+            spellings = {plainly, unquote(plainly), plainly.split()[-1] if plainly else ""} - {""}
+            waiting += [one.parent / spelling for spelling in spellings if "\0" not in spelling]
     return list(found)
 
 

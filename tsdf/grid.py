@@ -18,6 +18,7 @@ from tsdf.vectors import KERNEL, dot
 
 STEPS = 64  # of a ray through the grid; the ray engine is faster with those that need more
 OUTSIDE = 16  # facets that reach out of the grid, with more of which rays that leave it are left to the ray engine
+MOST_LISTED = 2e7  # facets in all cells, about: cells of very many large facets are larger
 BATCH = 1 << 17  # triangles and boxes that are looked at together
 PAD = 0.004  # [cells] facets count as in a cell when this near to it, far more than the rounding of the way through
 GRAZING = 100.0  # times its thickness is the most that a point is moved off a facet along a ray
@@ -224,7 +225,9 @@ def grid_of(meshes: Sequence[np.ndarray], planes: np.ndarray, thickness: np.ndar
         return Grid(np.zeros(3), 1.0, np.zeros((0, 0, 0), np.float32), np.zeros(1, np.int32), nothing, nothing,
                     not len(corners), not len(corners), corners, planes, mesh, thickness, 0.0)  # fmt: skip
     size = np.maximum(high - low, 1e-3 * (high - low).max())
-    edge = max(float((size.prod() / cells) ** (1 / 3)), least)
+    sides = np.sort(np.clip(corners.max(axis=1), low, high) - np.clip(corners.min(axis=1), low, high), axis=1)
+    area = float((sides[:, 1] * sides[:, 2]).sum())  # of the facets in the box, at most twice as much
+    edge = max(float((size.prod() / cells) ** (1 / 3)), math.sqrt(area / MOST_LISTED), least)
     counts = np.ceil(size / edge).astype(int) + 2
     low = 0.5 * (low + high) - 0.5 * counts * edge
     free, first, listed = cells_of(corners, planes, low, edge, counts)

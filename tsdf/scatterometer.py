@@ -393,7 +393,7 @@ class Build:
         errors = estimate.TableErrors(self.tally, self.effort.cells)
         progress.error = errors.fewest(target) or errors.rough()
         if progress.error.total_variation <= target:
-            progress.total = paths
+            progress.total = self.judgement = paths
             return True
         least, needed = (times * paths for times in errors.needed(target))
         sure = progress.error.sampling_noise < 0.5 * target
@@ -446,27 +446,33 @@ class Build:
         UsageError
             If the target is out of reach.
         """
-        progress, leave = Progress(self.paths), threading.Event()
+        progress, leave, tracing, ended = Progress(self.paths), *(threading.Event() for _ in range(3))
         outcome: list[BaseException] = []
 
         def work() -> None:
             try:
                 self._work(grain, threads, part, part_file, progress, report is not None, reflectance_scale,
-                           time.monotonic() + max_seconds, leave)  # fmt: skip
+                           time.monotonic() + max_seconds, leave, tracing)  # fmt: skip
             except BaseException as error:
                 outcome.append(error)
+            finally:
+                ended.set()
 
         # in a thread of its own, so that no signal finds counts half added or a file half written
         worker = threading.Thread(target=work, daemon=True)
         try:
             worker.start()
-            while worker.is_alive():
-                worker.join(0.1)
+            while not ended.wait(0.1):  # not Thread.join, which after an interrupt takes the thread for ended (3.11)
                 if report is not None:
                     report(progress)
+            if report is not None:
+                report(progress)
         except BaseException:
             leave.set()
-            worker.join(2.0 * ROUND_S)
+            if tracing.is_set():  # else it compiles, and has nothing that could be lost
+                ended.wait()
+            if outcome:
+                raise outcome[0] from None
             raise
         if outcome and "start new thread" in str(outcome[0]):
             raise MemoryError from outcome[0]
@@ -484,7 +490,7 @@ class Build:
 
     def _work(
         self, grain: Grain, threads: int, part: tuple[int, int], part_file: Path | None, progress: Progress,
-        tell: bool, reflectance_scale: float, deadline: float, leave: threading.Event,
+        tell: bool, reflectance_scale: float, deadline: float, leave: threading.Event, tracing: threading.Event,
     ) -> None:  # fmt: skip
         """Trace in rounds of about ROUND_S, two of them under way, until all is done, met, too late or left."""
         target = self.effort.target_error
@@ -500,6 +506,7 @@ class Build:
         effort, tally = self.effort, self.tally
         crew = Crew(grain, self.optics, effort.seed, effort.max_bounces, tally.joint, tally.memory, threads,
                     reflectance_scale)  # fmt: skip
+        tracing.set()
         under_way: deque[Round] = deque()
         pace, ahead, before, saved = _Pace(deadline), self.done, time.monotonic(), -math.inf
         with crew:
@@ -518,6 +525,8 @@ class Build:
                     break
                 under_way[0].wait(leave)
                 finished = crew.dismiss(under_way, ROUND_S) if leave.is_set() else [under_way.popleft()]
+                if leave.is_set() and target is not None:  # what was traced ahead would be judged, too, and too late
+                    finished = [one for one in finished if max(one.pieces.values())[1] <= self.judgement]
                 for one in finished:
                     spans, rays = crew.gather(one, tally)
                     self.done = joined([*self.done, *spans])

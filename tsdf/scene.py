@@ -84,7 +84,7 @@ class ConstantLight:
 
 @dataclass(frozen=True)
 class EnvironmentLight:
-    """Radiance from a picture of all directions; its middle lies along +x, with +y to its left."""
+    """Radiance from a picture of all directions; its middle lies along -x, with -y to its left."""
 
     file: Path
     scale: float = 1.0
