@@ -305,7 +305,7 @@ def near(table: Table, rounds: int, spp: int, folder: Path) -> list[str]:
             shipped = resized(load(SCENES / f"{name}.toml"), 160)
             made |= {f"{name}.toml, {level}": world.build(shipped, level) for level in levels}
         except TSDFError:
-            print(f"{name}.toml is left out: make demo makes its tables")
+            print(f"{name}.toml is left out: make tables makes its tables")
     for one in (bulk, *made.values()):
         render.render(one, spp=1, threads=1)
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in made}

@@ -38,7 +38,7 @@ def ball():
 
 
 def loaded(name, folder, width):
-    """The shipped scene, small, with the table of a sphere for each of its grains: tables are made by `make demo`."""
+    """The shipped scene, small, with the table of a sphere for each of its grains: tables are made by `make tables`."""
     data = tomllib.loads((FOLDER / f"{name}.toml").read_text())
     stand_in = folder / "any.tsdf.exr"
     stand_in.write_bytes(b"")
