@@ -26,7 +26,7 @@ demo: .venv/installed  ## tables of two kinds, plotted and validated, and one sm
 	$(BIN)/tsdf-validate demo/zhou2003.tsdf.exr --plot demo/zhou2003.png
 	$(BIN)/python scenes/make_assets.py
 	for level in explicit teleport-memory; do \
-		$(BIN)/tsdf-render scenes/beads.toml --level $$level --out demo/beads_$$level.exr --width 320 --spp 32 || exit; done
+		$(BIN)/tsdf-render scenes/beads.toml --level $$level --out demo/beads_$$level.exr --width 320 --spp 128 || exit; done
 	$(BIN)/python scenes/side_by_side.py demo/beads_explicit.exr demo/beads_teleport-memory.exr demo/beads.png
 	@echo "look at demo/*.png: glass and grain (tables), zhou2003 (a published curve), beads (two levels)"
 
