@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsdf.cli.common import Progress, Tool, check_numbers, check_output, plain, say, shown_progress
+from tsdf.cli.common import Progress, Tool, check_numbers, check_output, plain, say, shown_progress, whole_number
 from tsdf.cli.start import interrupt_status, interruptible
 from tsdf.errors import GrainError, TSDFError, UsageError
 
@@ -33,19 +33,6 @@ def _list_grains(context: click.Context, _: click.Parameter, value: bool) -> Non
             unit = f" {p.unit}" if p.unit else ""
             click.echo(f"    --set {key}={p.default:g}  {p.low:g} to {p.high:g}{unit}: {p.meaning}")
     context.exit()
-
-
-def _count(context: click.Context, parameter: click.Parameter, value: str | None) -> int | None:
-    """Read a whole number, also written as 1e7."""
-    if value is None:
-        return None
-    try:
-        number = float(value)
-        if number == int(number):
-            return int(value) if value.lstrip("+-").isdigit() else int(number)
-    except (ValueError, OverflowError):
-        pass
-    raise click.BadParameter(f"{value!r} is not a whole number", context, parameter)
 
 
 def _part(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -121,7 +108,7 @@ def told(progress: Progress, target: float | None) -> Callable[["Done"], None]:
     help="Fresnel reflectance averaged at each hit, or polarisations kept apart (sphere only).",
 )
 @click.option("--traced", is_flag=True, help="Send the exact sphere through the Monte Carlo tracer, too.")
-@click.option("--paths", callback=_count, metavar="N", help="Paths to trace.  [default: 4e6]")
+@click.option("--paths", callback=whole_number, metavar="N", help="Paths to trace.  [default: 4e6]")
 @click.option("--target-error", type=float, metavar="E", help="Stop at this estimated total variation of p_theta.")
 @click.option(
     "--max-seconds",
@@ -129,31 +116,38 @@ def told(progress: Progress, target: float | None) -> Callable[["Done"], None]:
     metavar="S",
     help="Stop tracing after S seconds and write the table as good as it got; --resume goes on all the same.",
 )
-@click.option("--cells", callback=_count, metavar="N", help="Cells of theta.  [default: 256, or what the target needs]")
 @click.option(
-    "--joint", callback=_count, default="0", metavar="K", show_default=True, help="Joint records per cell of theta."
+    "--cells", callback=whole_number, metavar="N", help="Cells of theta.  [default: 256, or what the target needs]"
+)
+@click.option(
+    "--joint",
+    callback=whole_number,
+    default="0",
+    metavar="K",
+    show_default=True,
+    help="Joint records per cell of theta.",
 )
 @click.option(
     "--memory",
-    callback=_count,
+    callback=whole_number,
     default="0",
     metavar="K",
     show_default=True,
     help="Records per cell of entry, which level teleport-memory draws from; 64 are many enough.",
 )
 @click.option(
-    "--seed", callback=_count, default="0", metavar="N", show_default=True, help="Seed of the random numbers."
+    "--seed", callback=whole_number, default="0", metavar="N", show_default=True, help="Seed of the random numbers."
 )
 @click.option(
     "--max-bounces",
-    callback=_count,
+    callback=whole_number,
     default="100000",
     metavar="N",
     show_default=True,
     help="Hits before a path is cut.",
 )
 @click.option(
-    "--threads", callback=_count, metavar="N", help="Threads; the result does not depend on it.  [default: all]"
+    "--threads", callback=whole_number, metavar="N", help="Threads; the result does not depend on it.  [default: all]"
 )
 @click.option("--repair", is_flag=True, help="Try to close an open mesh, and say what that changed.")
 @click.option("--repair-any", is_flag=True, help="As --repair, even if more than a tenth of the surface is new.")

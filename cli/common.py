@@ -254,6 +254,19 @@ def shown_progress(quiet: bool) -> Iterator[Progress]:
 # --- options ------------------------------------------------------------------------
 
 
+def whole_number(context: click.Context, parameter: click.Parameter, value: str | None) -> int | None:
+    """Read a whole number, also written as 1e7."""
+    if value is None:
+        return None
+    try:
+        number = float(value)
+        if number == int(number):
+            return int(value) if value.lstrip("+-").isdigit() else int(number)
+    except (ValueError, OverflowError):
+        pass
+    raise click.BadParameter(f"{value!r} is not a whole number", context, parameter)
+
+
 def check_numbers(seed: int | None = None, threads: int | None = None, **counts: int | None) -> None:
     """Refuse whole numbers that are out of range; None is not given.
 

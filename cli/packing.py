@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsdf.cli.build import _count
-from tsdf.cli.common import Tool, check_output, plain, say, shown_progress
+from tsdf.cli.common import Tool, check_output, plain, say, shown_progress, whole_number
 from tsdf.errors import UsageError
 
 if TYPE_CHECKING:
@@ -28,25 +27,32 @@ if TYPE_CHECKING:
     "[default: 0.05, 0.1, ... 0.6, 0.62, 0.64]",
 )
 @click.option(
-    "--packings", callback=_count, default="4", metavar="N", show_default=True, help="Packings of each fraction."
+    "--packings", callback=whole_number, default="4", metavar="N", show_default=True, help="Packings of each fraction."
 )
 @click.option(
-    "--spheres", callback=_count, default="2000", metavar="N", show_default=True, help="Spheres of each packing."
+    "--spheres", callback=whole_number, default="2000", metavar="N", show_default=True, help="Spheres of each packing."
 )
 @click.option(
     "--lines",
-    callback=_count,
+    callback=whole_number,
     default="15000",
     metavar="N",
     show_default=True,
     help="Lines through each packing, of about 32 gaps.",
 )
 @click.option(
-    "--cells", callback=_count, default="32", metavar="N", show_default=True, help="Cells of the exit's obliquity."
+    "--cells",
+    callback=whole_number,
+    default="32",
+    metavar="N",
+    show_default=True,
+    help="Cells of the exit's obliquity.",
 )
-@click.option("--records", callback=_count, default="256", metavar="K", show_default=True, help="Records of each cell.")
 @click.option(
-    "--seed", callback=_count, default="0", metavar="N", show_default=True, help="Seed of the random numbers."
+    "--records", callback=whole_number, default="256", metavar="K", show_default=True, help="Records of each cell."
+)
+@click.option(
+    "--seed", callback=whole_number, default="0", metavar="N", show_default=True, help="Seed of the random numbers."
 )
 @click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
 def main(
