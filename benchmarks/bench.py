@@ -18,12 +18,13 @@ from pathlib import Path
 import numpy as np
 
 import tsdf
-from tsdf import analytic, estimate
-from tsdf.grains import Grain, embree_scene, load_grain
-from tsdf.optics import Optics
-from tsdf.scatterometer import Build, Effort, exact_sphere
-from tsdf.tally import Tally
-from tsdf.tracer import Tracer, in_order
+from tsdf.grain.grains import Grain, embree_scene, load_grain
+from tsdf.grain.optics import Optics
+from tsdf.judge import analytic
+from tsdf.make import estimate
+from tsdf.make.scatterometer import Build, Effort, exact_sphere
+from tsdf.make.tally import Tally
+from tsdf.make.tracer import Tracer, in_order
 
 ETA = 1.31
 CELLS = 256

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from bench_sampler import algorithm_1, built, joint_records
 
-from tsdf import format as tsdf_format
-from tsdf.sampler import compile_tables
+from tsdf.data import format as tsdf_format
+from tsdf.data.sampler import compile_tables
 
 ROOT = Path(__file__).parent.parent
 

@@ -14,12 +14,12 @@ import mitsuba as mi
 import numpy as np
 
 import tsdf.loaders.mitsuba as loader
-from tsdf import format as tsdf_format
-from tsdf import render, world
-from tsdf.grains import load_grain
-from tsdf.optics import Optics
-from tsdf.scatterometer import Effort, exact_sphere
-from tsdf.scene import Box, Camera, ConstantLight, GrainSpec, MediumSpec, Scene
+from tsdf.data import format as tsdf_format
+from tsdf.grain.grains import load_grain
+from tsdf.grain.optics import Optics
+from tsdf.make.scatterometer import Effort, exact_sphere
+from tsdf.picture import render, world
+from tsdf.scene.scene import Box, Camera, ConstantLight, GrainSpec, MediumSpec, Scene
 
 PACKING = 0.5
 SIDE = 48  # pixels

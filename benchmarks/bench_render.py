@@ -27,14 +27,15 @@ from pathlib import Path
 import numpy as np
 from bench_sampler import algorithm_1, built, henyey_greenstein, joint_records
 
-from tsdf import image, render, world
+from tsdf.data.sampler import compile_tables
+from tsdf.data.table import Table
 from tsdf.errors import TSDFError
-from tsdf.grains import load_grain
-from tsdf.optics import Optics
-from tsdf.render import Picture, Walkers
-from tsdf.sampler import compile_tables
-from tsdf.scatterometer import Build, Effort, exact_sphere
-from tsdf.scene import (
+from tsdf.grain.grains import load_grain
+from tsdf.grain.optics import Optics
+from tsdf.make.scatterometer import Build, Effort, exact_sphere
+from tsdf.picture import image, render, world
+from tsdf.picture.render import Picture, Walkers
+from tsdf.scene.scene import (
     Absorption,
     Box,
     Camera,
@@ -52,8 +53,7 @@ from tsdf.scene import (
     load,
     resized,
 )
-from tsdf.table import Table
-from tsdf.transport import EVENTS, Job
+from tsdf.walk.transport import EVENTS, Job
 
 FRACTION = 0.6
 LARGE = 500.0  # [R] radius of the ball of grains

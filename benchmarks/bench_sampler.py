@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
-from tsdf import format as tsdf_format
-from tsdf.grains import load_grain
-from tsdf.optics import Optics
-from tsdf.sampler import DRAWN, compile_tables, draw_column, draw_length, draw_offset, draw_record, leave, turned
+from tsdf.data import format as tsdf_format
+from tsdf.data.sampler import DRAWN, compile_tables, draw_column, draw_length, draw_offset, draw_record, leave, turned
+from tsdf.data.table import Table
+from tsdf.grain.grains import load_grain
+from tsdf.grain.optics import Optics
+from tsdf.make.scatterometer import Build, Effort
 from tsdf.sampling import mix
-from tsdf.scatterometer import Build, Effort
-from tsdf.table import Table
 from tsdf.vectors import frame
 
 STEP = np.uint64(0x9E3779B97F4A7C15)

@@ -15,11 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from tsdf import image, render, scatterometer, world
-from tsdf.grains import load_grain
-from tsdf.optics import Optics
-from tsdf.scatterometer import Effort
-from tsdf.scene import Camera, EnvironmentLight, GrainSpec, MediumSpec, Mesh, Rectangle, Scene, SurfaceSpec
+from tsdf.grain.grains import load_grain
+from tsdf.grain.optics import Optics
+from tsdf.make import scatterometer
+from tsdf.make.scatterometer import Effort
+from tsdf.picture import image, render, world
+from tsdf.scene.scene import Camera, EnvironmentLight, GrainSpec, MediumSpec, Mesh, Rectangle, Scene, SurfaceSpec
 
 LEVELS = ("teleport-memory", "teleport-joint")
 CAMERA = Camera((10.0, -70.0, 40.0), (0.0, 0.0, 9.0), 60, 40, fov_deg=34.0)

@@ -52,9 +52,10 @@ def main(
     chosen = named_levels(levels, MEASURED)
     check_numbers(seed, threads=threads)
 
-    from tsdf import accuracy, format, plots
+    from tsdf.data import format
     from tsdf.files import replacing
-    from tsdf.scene import GrainSpec
+    from tsdf.scene.scene import GrainSpec
+    from tsdf.study import accuracy, plots
 
     read = format.read(table)
     meshes = [] if mesh is None else [mesh]

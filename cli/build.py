@@ -14,8 +14,8 @@ from tsdf.cli.start import interrupt_status, interruptible
 from tsdf.errors import GrainError, TSDFError, UsageError
 
 if TYPE_CHECKING:
-    from tsdf.scatterometer import Progress as Done
-    from tsdf.table import Table
+    from tsdf.data.table import Table
+    from tsdf.make.scatterometer import Progress as Done
 
 LONG_S = 600.0  # [s] what takes longer deserves a note
 DEFAULT_MATERIAL, DEFAULT_WAVELENGTH_NM = "ice", 550.0
@@ -24,7 +24,7 @@ DEFAULT_MATERIAL, DEFAULT_WAVELENGTH_NM = "ice", 550.0
 def _list_grains(context: click.Context, _: click.Parameter, value: bool) -> None:
     if not value or context.resilient_parsing:
         return
-    from tsdf.exemplars import EXEMPLARS
+    from tsdf.grain.exemplars import EXEMPLARS
 
     click.echo("sphere: the exact sphere, by quadrature (or --traced)")
     for name, exemplar in EXEMPLARS.items():
@@ -207,11 +207,11 @@ def main(
     if (repair or repair_any) and grain == "sphere":
         raise UsageError("--repair is for mesh files")
 
-    from tsdf import scatterometer
-    from tsdf.optics import Optics
+    from tsdf.grain.optics import Optics
+    from tsdf.make import scatterometer
 
     if eta is None:
-        from tsdf.constants import constants_of
+        from tsdf.grain.constants import constants_of
 
         found = constants_of(
             material or DEFAULT_MATERIAL, DEFAULT_WAVELENGTH_NM if wavelength_nm is None else wavelength_nm
@@ -232,7 +232,7 @@ def main(
             raise TSDFError(f"{part_file} exists already: add --resume to go on with it, or choose another --out")
         raise TSDFError(f"{part_file} holds an unfinished build: add --resume to go on with it, or delete it")
 
-    from tsdf.grains import load_grain
+    from tsdf.grain.grains import load_grain
 
     shape = load_grain(grain, repair="any" if repair_any else repair, **settings)
     if not quiet:
@@ -292,7 +292,7 @@ def main(
 
 def finish(table: "Table", out: Path, quiet: bool, part_file: Path | None = None) -> None:
     """Write a finished table, remove its part file, and sum it up on standard output, which may be closed or full."""
-    from tsdf.format import write
+    from tsdf.data.format import write
 
     write(table, out)
     if part_file is not None:

@@ -17,10 +17,10 @@ from typing import Any, NoReturn
 
 import click
 
-from tsdf import levels
 from tsdf.cli import start
 from tsdf.cli.start import answer, interrupt_status
 from tsdf.errors import TSDFError, UsageError
+from tsdf.scene import levels
 
 LEVELS = tuple(levels.LEVELS)
 MOST_THREADS = 1024

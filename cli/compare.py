@@ -11,8 +11,8 @@ from tsdf.cli.render import save
 from tsdf.cli.start import interrupt_status, interruptible
 
 if TYPE_CHECKING:
-    from tsdf.render import Picture
-    from tsdf.world import World
+    from tsdf.picture.render import Picture
+    from tsdf.picture.world import World
 
 
 @click.command("tsdf-compare", cls=Tool)
@@ -47,9 +47,9 @@ def main(
     chosen = named_levels(levels, LEVELS)
     check_numbers(seed, spp=spp, width=width, threads=threads)
 
-    from tsdf import compare, plots
     from tsdf.files import replacing
-    from tsdf.scene import files_of, load, resized
+    from tsdf.scene.scene import files_of, load, resized
+    from tsdf.study import compare, plots
 
     read = resized(load(scene), width)
     pictures = [f"{name}{suffix}" for name in (*LEVELS, "reference") for suffix in (".exr", ".png")]

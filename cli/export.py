@@ -73,9 +73,9 @@ def main(
     if out is not None:
         check_output(Path(out), Path(file))
 
-    from tsdf import format
+    from tsdf.data import format
     from tsdf.loaders import export
-    from tsdf.scene import Absorption
+    from tsdf.scene.scene import Absorption
 
     table = format.read(file)
     if material is not None:
@@ -105,7 +105,7 @@ def main(
 def _check_material(name: str) -> None:
     """Refuse what does not absorb or is not known."""
     from tsdf.errors import UsageError
-    from tsdf.scene import ABSORBING
+    from tsdf.scene.scene import ABSORBING
 
     if name not in ABSORBING:
         raise UsageError(f"--material: no absorbing material {plain(name)!r}; there are {', '.join(ABSORBING)}")

@@ -10,7 +10,7 @@ import click
 from tsdf.cli.common import Tool, plain
 
 if TYPE_CHECKING:
-    from tsdf.table import Table
+    from tsdf.data.table import Table
 
 LENGTHS = ("lambda_b", "lambda_beta", "lambda_s")  # of the medium
 COEFFICIENTS = ("sigma_t", "sigma_s", "sigma_a")
@@ -44,8 +44,8 @@ def main(
     file: str, as_json: bool, absorption: str | None, packing: float | None, radius: float | None, unit: float | None
 ) -> None:
     """Show what the table FILE holds: grain, optics, statistics with standard errors, errors, energy, origin."""
-    from tsdf import format
     from tsdf.cli.absorption import times_radius
+    from tsdf.data import format
     from tsdf.errors import UsageError
 
     if radius is not None and packing is None and absorption is None:
@@ -71,7 +71,7 @@ def describe(table: "Table", absorption_times_radius: float = 0.0, radius: float
     With absorption (sigma_a R), `albedo` and `mean_cosine` are those of the absorbing grain. Their standard errors are
     unknown.
     """
-    from tsdf.table import CONDITIONALS, thawed
+    from tsdf.data.table import CONDITIONALS, thawed
 
     header = thawed(table.header)
     grain, optics, made = header["grain"], header["optics"], header["provenance"]
@@ -112,7 +112,7 @@ def describe_medium(
     Lengths are in the unit of `radius`, or in R where it is None; absorption is sigma_a R.
     """
     from tsdf.errors import UsageError
-    from tsdf.medium import Component, free_path, volume_parameters
+    from tsdf.scene.medium import Component, free_path, volume_parameters
 
     unit = 1.0 if radius is None else radius
     try:

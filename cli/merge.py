@@ -15,6 +15,6 @@ from tsdf.cli.common import Tool, check_output
 def main(parts: tuple[Path, ...], out: Path, quiet: bool) -> None:
     """Merge the PARTS that tsdf-build --chunk i/n wrote, in any order, into one table."""
     check_output(out, *parts)
-    from tsdf.scatterometer import merge
+    from tsdf.make.scatterometer import merge
 
     finish(merge(list(parts)).table(), out, quiet)

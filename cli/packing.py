@@ -10,7 +10,7 @@ from tsdf.cli.common import Tool, check_output, plain, say, shown_progress, whol
 from tsdf.errors import UsageError
 
 if TYPE_CHECKING:
-    from tsdf.neighbours import PackingTable
+    from tsdf.spheres.neighbours import PackingTable
 
 
 @click.command("tsdf-packing", cls=Tool)
@@ -77,7 +77,7 @@ def main(
     if file is not None and not info:
         raise UsageError("FILE goes with --info; the table to make is named by --out")
 
-    from tsdf import neighbours
+    from tsdf.spheres import neighbours
 
     if out is None:
         for line in _lines(neighbours.shipped() if file is None else neighbours.read(file)):

@@ -17,10 +17,10 @@ def main(file: str, out: str) -> None:
     p_theta as a density over cos theta, and the densities of phi_Delta, r, z and the path length given cos theta.
     Lengths are in units of the bounding radius R. Light in the atoms stands beside the axes.
     """
-    from tsdf import plots
+    from tsdf.study import plots
 
     plots.check_suffix(out)
     check_output(Path(out), Path(file))
-    from tsdf import format
+    from tsdf.data import format
 
     plots.save(plots.plot_table(format.read(file)), out)

@@ -11,8 +11,8 @@ from tsdf.cli.common import LEVELS, Tool, check_numbers, check_output, plain, sa
 from tsdf.cli.start import interrupt_status, interruptible
 
 if TYPE_CHECKING:
-    from tsdf.render import Picture
-    from tsdf.world import World
+    from tsdf.picture.render import Picture
+    from tsdf.picture.world import World
 
 
 @click.command("tsdf-render", cls=Tool)
@@ -53,8 +53,8 @@ def main(
     if sum(stop is not None for stop in (spp, seconds, target_error)) > 1:
         raise UsageError("--spp, --seconds and --target-error each say when to stop: give one")
 
-    from tsdf import image, render, world
-    from tsdf.scene import files_of, load, resized
+    from tsdf.picture import image, render, world
+    from tsdf.scene.scene import files_of, load, resized
 
     read = resized(load(scene), width)
     check_output(out, scene, *files_of(read), beside=[out.with_suffix(".png")])
@@ -95,7 +95,8 @@ def main(
 
 def save(world: "World", picture: "Picture", seed: int, out: Path) -> None:
     """Write the EXR, with what it was made by as the attribute ``tsdf_render``, and the PNG beside it."""
-    from tsdf import estimate, image
+    from tsdf.make import estimate
+    from tsdf.picture import image
 
     facts = {
         "scene": world.scene.name,

@@ -27,13 +27,13 @@ def main(files: tuple[str, ...], as_json: bool, structure: bool, plot: str | Non
     Exit status 0 if no file has an error, 1 if any has, 2 if the request makes no sense.
     """
     if plot is not None:
-        from tsdf import plots
+        from tsdf.study import plots
 
         plots.check_suffix(plot)
         if len(files) != 1 or structure:
             raise UsageError("--plot draws one FILE, checked in full")
         check_output(Path(plot), Path(files[0]))
-    from tsdf.validate import validate
+    from tsdf.judge.validate import validate
 
     reports, failed = [], False
     for file in files:

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from tsdf import format as files
+from tsdf.data import format as files
+from tsdf.data.table import Table
 from tsdf.errors import TSDFError
-from tsdf.grains import Grain, grain_from_mesh, load_grain
-from tsdf.optics import Optics
-from tsdf.scatterometer import Build, Effort, exact_sphere
-from tsdf.table import Table
+from tsdf.grain.grains import Grain, grain_from_mesh, load_grain
+from tsdf.grain.optics import Optics
+from tsdf.make.scatterometer import Build, Effort, exact_sphere
 
 BUILT_INS = {
     "cube": {},

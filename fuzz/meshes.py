@@ -1,7 +1,7 @@
 """Damaged mesh files: python fuzz/meshes.py --count 10000
 
-Small files of every kind that `tsdf.meshes` reads are damaged (bytes turned, cut out, doubled; numbers replaced by
-others, in packed and compressed text too) and loaded as grains in a process of limited memory. Right is a grain or a
+Small files of every kind that `tsdf.grain.meshes` reads are damaged (bytes turned, cut out, doubled; numbers replaced
+by others, in packed and compressed text too) and loaded as grains in a process of limited memory. Right is a grain or a
 GrainError of one line, within `SECONDS` and `MEMORY`; whatever else happens is kept in the folder of --keep.
 """
 
@@ -349,7 +349,7 @@ def work() -> None:
     import warnings
 
     from tsdf.errors import TSDFError
-    from tsdf.grains import load_grain
+    from tsdf.grain.grains import load_grain
 
     warnings.simplefilter("error")
     load_grain("snow")  # everything is imported and compiled

@@ -93,10 +93,11 @@ def files(folder: Path) -> None:
     import OpenEXR
     import trimesh
 
-    from tsdf import format, image
-    from tsdf.grains import load_grain
-    from tsdf.optics import Optics
-    from tsdf.scatterometer import Effort, exact_sphere
+    from tsdf.data import format
+    from tsdf.grain.grains import load_grain
+    from tsdf.grain.optics import Optics
+    from tsdf.make.scatterometer import Effort, exact_sphere
+    from tsdf.picture import image
 
     rng = np.random.default_rng(0)
     image.write_exr(folder / "sky.exr", rng.random((8, 16, 3)) ** 8)
@@ -196,9 +197,9 @@ def trial(path: Path) -> str:
     AssertionError, Exception, TooSlow
         What must not happen.
     """
-    from tsdf import render, world
     from tsdf.errors import TSDFError
-    from tsdf.scene import load
+    from tsdf.picture import render, world
+    from tsdf.scene.scene import load
 
     try:
         scene = load(path)

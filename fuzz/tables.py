@@ -1,9 +1,10 @@
 """Mutated tables: both readers must refuse what is no table, by the same rule, and read what is one as it is.
 
 ``python fuzz/tables.py --count 100000 --seed 0`` makes so many files out of the golden ones: bytes, text of the header,
-values, pixels and container are changed, mostly with digests that are right again. Each is read by `tsdf.format` and,
-where g++ is there, by ``loaders/tsdf.hpp``, many files in one process. What is read must be what was put in, and be of
-use. ``--only I`` writes file I of this seed to ``table_I.tsdf.exr`` and says what is found. Exit status 1 for a fault.
+values, pixels and container are changed, mostly with digests that are right again. Each is read by `tsdf.data.format`
+and, where g++ is there, by ``loaders/tsdf.hpp``, many files in one process. What is read must be what was put in, and
+be of use. ``--only I`` writes file I of this seed to ``table_I.tsdf.exr`` and says what is
+found. Exit status 1 for a fault.
 """
 
 import argparse
@@ -26,10 +27,10 @@ from typing import Any
 
 import numpy as np
 
-from tsdf import format as tsdf_format
-from tsdf.medium import Component, free_path, volume_parameters
+from tsdf.data import format as tsdf_format
+from tsdf.data.table import Table, thawed
 from tsdf.reference_data import make_golden
-from tsdf.table import Table, thawed
+from tsdf.scene.medium import Component, free_path, volume_parameters
 
 ROOT = Path(__file__).parents[1]
 CHECK = ROOT / "loaders" / "cpp" / "check_tsdf.cpp"

@@ -2,7 +2,7 @@
 
 All renderers here get the level volume-hg: point scatterers with Henyey-Greenstein lobes. What that costs stands in
 each text, as `notes` says it. Coefficients are in 1/scene unit and of linear sRGB; the medium's boundary is
-index-matched, for a heap of grains has no surface of its own. The numbers themselves are from `tsdf.medium`.
+index-matched, for a heap of grains has no surface of its own. The numbers themselves are from `tsdf.scene.medium`.
 
 [1] Kulla & Conty 2017, Revisiting physically based shading at Imageworks (SIGGRAPH course), albedo inversion
 [2] OpenPBR 1.1, section on the translucent base; MaterialX 1.39, physically based shading nodes
@@ -24,13 +24,13 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from tsdf import image
+from tsdf.data.table import CONDITIONALS, Table, thawed
 from tsdf.errors import UsageError
 from tsdf.files import replacing
-from tsdf.lights import LUMINANCE
-from tsdf.medium import Component, VolumeParameters, volume_parameters
-from tsdf.scene import Absorption, absorption_at
-from tsdf.table import CONDITIONALS, Table, thawed
+from tsdf.picture import image
+from tsdf.scene.medium import Component, VolumeParameters, volume_parameters
+from tsdf.scene.scene import Absorption, absorption_at
+from tsdf.walk.lights import LUMINANCE
 
 ENOUGH = 0.02  # [1] total variation up to which one lobe is taken where a target could mix two
 BETTER = 0.9  # [1] of the error of one lobe, which two must stay below
@@ -242,7 +242,8 @@ def measure(medium: Bulk, thickness: float, samples: int = 20_000, seed: int = 0
 
     The slab lies in the scene as `thickness` [scene unit] says; luminance of the colour counts.
     """
-    from tsdf import render, scene, world
+    from tsdf.picture import render, world
+    from tsdf.scene import scene
 
     camera = scene.Camera((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 1, 1, up=(0.0, 1.0, 0.0))
     grains = (scene.GrainSpec(medium.table, absorption=Absorption("rgb", medium.absorption)),)

@@ -2,9 +2,9 @@
 
 Importing this module registers the plugins with every variant that is set, before or after. A shape with BSDF ``null``
 and interior medium ``granular`` holds grains; the integrator ``tpt`` follows Algorithm 1 and the boundary rules of Meng
-et al. 2015 (supplemental), as `tsdf.transport` does, which is the arbiter. Deep inside a medium, farther from every
-surface than the next step reaches by a grid of distances, it needs no ray. Constant light is never drawn, so a furnace
-reads exactly 1. Lengths are in scene units. What light does in a grain is `tsdf.sampler`.
+et al. 2015 (supplemental), as `tsdf.walk.transport` does, which is the arbiter. Deep inside a medium, farther from
+every surface than the next step reaches by a grid of distances, it needs no ray. Constant light is never drawn, so a
+furnace reads exactly 1. Lengths are in scene units. What light does in a grain is `tsdf.data.sampler`.
 """
 
 # ruff: noqa: SIM102 - of nested conditions the outer is decided when a kernel is made, the inner in it
@@ -19,10 +19,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tsdf import format as tsdf_format
+from tsdf.data import format as tsdf_format
+from tsdf.data.table import Table
 from tsdf.errors import SceneError, TSDFError, UsageError
-from tsdf.medium import Component, free_path, volume_parameters
-from tsdf.table import Table
+from tsdf.scene.medium import Component, free_path, volume_parameters
 
 OLDEST = (3, 6)  # version of Mitsuba: dr.syntax, Properties that hold objects
 INSTALL = 'pip install "tsdf-toolkit[mitsuba]"'
@@ -213,8 +213,8 @@ def medium(
     -------
     dict
         For ``interior`` or ``exterior`` of a shape in ``mi.load_dict``; its sigma_t times scale, albedo and mean cosine
-        are those of `tsdf.medium.volume_parameters`. ``tabphase`` is grey: coloured absorption colours sigma_t and
-        albedo only.
+        are those of `tsdf.scene.medium.volume_parameters`. ``tabphase`` is grey: coloured absorption colours sigma_t
+        and albedo only.
 
     Raises
     ------

@@ -95,11 +95,11 @@ def main() -> int:
     args = parser.parse_args()
     try:
         import tsdf.loaders.mitsuba as loader
-        from tsdf import format as tsdf_format
-        from tsdf import image
-        from tsdf.grains import load_grain
-        from tsdf.optics import Optics
-        from tsdf.scatterometer import Effort, exact_sphere
+        from tsdf.data import format as tsdf_format
+        from tsdf.grain.grains import load_grain
+        from tsdf.grain.optics import Optics
+        from tsdf.make.scatterometer import Effort, exact_sphere
+        from tsdf.picture import image
 
         loader.set_variant(args.variant)
         import mitsuba as mi

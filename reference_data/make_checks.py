@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from tsdf import format
+from tsdf.data import format
+from tsdf.data.table import thawed
 from tsdf.reference_data.make_golden import Header, file
-from tsdf.table import thawed
 
 CHECKS = Path(__file__).parent / "golden" / "checks"
 BASES = ("sphere", "cube", "cube_identity", "sphere_memory", "cube_memory")
@@ -25,12 +25,12 @@ BASES = ("sphere", "cube", "cube_identity", "sphere_memory", "cube_memory")
 
 def bases() -> None:
     """Build the sound tables with this library."""
-    from tsdf import estimate
-    from tsdf.exact import exact_table
-    from tsdf.grains import load_grain
-    from tsdf.optics import Optics
-    from tsdf.tally import Tally
-    from tsdf.tracer import Tracer
+    from tsdf.grain.grains import load_grain
+    from tsdf.grain.optics import Optics
+    from tsdf.make import estimate
+    from tsdf.make.exact import exact_table
+    from tsdf.make.tally import Tally
+    from tsdf.make.tracer import Tracer
 
     def grain_of(name: str) -> tuple[Any, Header]:
         g = load_grain(name)
@@ -202,7 +202,7 @@ def checks() -> dict[str, bytes]:
 
 def expected(path: Path) -> dict[str, Any]:
     """Return what stands beside a file: the findings, without their numbers."""
-    from tsdf.validate import validate
+    from tsdf.judge.validate import validate
 
     findings = validate(path).findings
     return {"findings": [{"code": f.code, "severity": f.severity, "pointer": f.pointer} for f in findings]}

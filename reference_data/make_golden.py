@@ -1,6 +1,6 @@
 """Makes ``golden/``: run ``python -m tsdf.reference_data.make_golden``; the same bytes every time.
 
-The files are put together here by hand, not by `tsdf.format.write`: so they do not change with OpenEXR, they
+The files are put together here by hand, not by `tsdf.data.format.write`: so they do not change with OpenEXR, they
 can break every rule, and they are a second opinion on the layout. The tables are made up, but obey every rule
 that a real one obeys: the conditionals are histograms of joint records, and all records lie on the sphere.
 """
@@ -604,8 +604,8 @@ def invalid() -> dict[str, bytes]:
 
 def content(data: bytes) -> Header:
     """Return what a reader finds in a valid file; a pixel is the shortest number that gives its float32."""
-    from tsdf.format import inspect
-    from tsdf.table import thawed
+    from tsdf.data.format import inspect
+    from tsdf.data.table import thawed
 
     made, findings = inspect(data)
     assert made is not None, findings
@@ -619,7 +619,7 @@ def content(data: bytes) -> Header:
 
 def report(data: bytes) -> Header:
     """Return the findings for an invalid file, without the words."""
-    from tsdf.format import inspect
+    from tsdf.data.format import inspect
 
     keys = ("code", "severity", "pointer")
     return {"findings": [{key: getattr(finding, key) for key in keys} for finding in inspect(data)[1]]}

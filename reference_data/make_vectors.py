@@ -1,6 +1,6 @@
 """Makes ``sample_vectors.csv``: run ``python -m tsdf.reference_data.make_vectors``; the same bytes every time.
 
-Random numbers and the events that `tsdf.sampler` makes of them, for implementations in other languages to be held
+Random numbers and the events that `tsdf.data.sampler` makes of them, for implementations in other languages to be held
 against. The numbers are multiples of 2^-24, and so exact as 32-bit floats; each edge of [0, 1) stands in each place.
 """
 
@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tsdf import format as tsdf_format
-from tsdf.sampler import Sampler
+from tsdf.data import format as tsdf_format
+from tsdf.data.sampler import Sampler
 
 FOLDER = Path(__file__).parent
 VECTORS = FOLDER / "sample_vectors.csv"

@@ -3,8 +3,8 @@
     python scenes/make_assets.py
 
 Meshes are closed, manifold and stand on z = 0; the boundaries of media have one sheet above each point of the floor, so
-they cannot cross themselves. Skies are latitude-longitude images as `tsdf.lights` has them: row 0 is the zenith, the
-middle of the width +x, left of it +y.
+they cannot cross themselves. Skies are latitude-longitude images as `tsdf.walk.lights` has them: row 0 is the zenith,
+the middle of the width +x, left of it +y.
 """
 
 import sys
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tsdf import image
+from tsdf.picture import image
 
 Array = np.ndarray
 

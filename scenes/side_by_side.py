@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tsdf import image
+from tsdf.picture import image
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, ITU-R BT.709
 

@@ -14,48 +14,9 @@ from tsdf.compiled import imported
 PACKAGE = Path(tsdf.__file__).parent
 ROOT = PACKAGE.parent
 
-# What each module may import of the package: only what stands below it.
-LAYERS = [
-    {"errors", "levels"},
-    {
-        "files",
-        "compiled",
-        "container",
-        "optics",
-        "materials",
-        "table",
-        "tally",
-        "archive",
-        "constants",
-        "analytic",
-        "exemplars",
-        "surface",
-        "sampling",
-        "vectors",
-        "handle",
-        "grid",
-        "horizon",
-        "image",
-        "lights",
-        "medium",
-        "polygons",
-        "gltf",
-        "vtk",
-        "meshes",
-        "packing",
-        "room",
-    },
-    {"grains", "format", "estimate", "horizon", "neighbours", "sampler", "scene"},
-    {"tracer", "exact", "geometry"},
-    {"crew"},
-    {"scatterometer", "validate", "plots", "explicit", "walker"},
-    {"memory"},
-    {"transport"},
-    {"world"},
-    {"render"},
-    {"experiment"},
-    {"accuracy", "compare"},
-]
+# Rooms in order: a module imports those of its own room and of the rooms before it. "" is the root.
+ROOMS = ["", "grain", "data", "judge", "make", "spheres", "scene", "walk", "picture", "study"]
+ROOT_MODULES = {"archive", "compiled", "errors", "files", "handle", "sampling", "vectors"}
 DOORS = {
     "numba": {"compiled", "handle"},
     "DracoPy": {"gltf"},
@@ -73,7 +34,7 @@ DOORS = {
 
 
 def imports(path: Path) -> list[tuple[str, bool]]:
-    """Return the modules a file imports and whether at its top level."""
+    """Return the modules a file imports, in full, and whether at its top level."""
     tree = ast.parse(path.read_text())
     top = set(map(id, tree.body))
     found = []
@@ -81,35 +42,60 @@ def imports(path: Path) -> list[tuple[str, bool]]:
         if isinstance(node, ast.Import):
             found += [(alias.name, id(node) in top) for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
-            names = [f"tsdf.{a.name}" for a in node.names] if node.module == "tsdf" else [node.module]
-            found += [(name, id(node) in top) for name in names]
+            below = [f"{node.module}.{a.name}" for a in node.names]
+            inside = [name for name in below if name.startswith("tsdf.") and name[5:] in NAMES]
+            found += [(name, id(node) in top) for name in inside or [node.module]]
     return found
 
 
 def modules() -> list[Path]:
-    return sorted(p for p in PACKAGE.glob("*.py") if p.name != "__init__.py")
+    return sorted(p for p in PACKAGE.rglob("*.py") if p.name != "__init__.py")
 
 
-def test_every_module_has_a_layer() -> None:
-    assert {p.stem for p in modules()} == set().union(*LAYERS)
+def named(path: Path) -> str:
+    """Return the name of a module within the package: walk.memory."""
+    return ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda p: p.stem)
+def own(path: Path) -> set[str]:
+    """Return the modules of the package that a module imports, by their names within it, at its top or later."""
+    return {name[5:] for name, _ in imports(path) if name.startswith("tsdf.") and name[5:] in NAMES}
+
+
+NAMES = {named(path) for path in modules()}
+
+
+def test_every_module_has_a_room() -> None:
+    assert {name for name in NAMES if "." not in name} == ROOT_MODULES
+    assert {name.split(".")[0] for name in NAMES if "." in name} == set(ROOMS) - {""}
+
+
+@pytest.mark.parametrize("path", modules(), ids=named)
 def test_imports_point_down(path: Path) -> None:
-    """A module imports only modules of lower layers, or of its own layer without a circle (`table` and the like)."""
-    layer = next(i for i, names in enumerate(LAYERS) if path.stem in names)
-    below = set().union(*LAYERS[:layer])
-    same = LAYERS[layer]
-    for name, _ in imports(path):
-        if name.startswith("tsdf.") and name.split(".")[1] not in ("reference_data", "schema"):
-            target = name.split(".")[1]
-            assert target in below | same and target != path.stem, f"{path.stem} imports {target}"
+    """A module imports only from its own room and from rooms before it."""
+    rooms = ROOMS[: 1 + ROOMS.index(named(path).rpartition(".")[0])]
+    for name in own(path):
+        assert name.rpartition(".")[0] in rooms, f"{named(path)} imports {name}"
+
+
+def circle(arrows: dict[str, set[str]]) -> list[str]:
+    """Return the names that stand in a circle or behind one: what is left when all that need nothing more are gone."""
+    left = dict(arrows)
+    while free := [name for name, needs in left.items() if not needs & set(left)]:
+        for name in free:
+            del left[name]
+    return sorted(left)
+
+
+def test_no_circle() -> None:
+    """Modules can be put into an order in which each imports only earlier ones; a circle would be found."""
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": set()}) == ["a", "b", "c"]
+    assert circle({named(path): own(path) for path in modules()}) == []
 
 
 def test_the_judge_does_not_import_the_judged() -> None:
     """`analytic` says what the answer should be, so it shares no more with what computes it than errors and numba."""
-    own = {name for name, _ in imports(PACKAGE / "analytic.py") if name.startswith("tsdf")}
-    assert own == {"tsdf.errors", "tsdf.compiled"}
+    assert own(PACKAGE / "judge/analytic.py") == {"errors", "compiled"}
 
 
 @pytest.mark.parametrize("third_party", DOORS)
@@ -122,16 +108,16 @@ def test_one_door_for_each_heavy_third_party(third_party: str) -> None:
                 assert not at_top or third_party == "numba", f"{path.stem} imports {third_party} at its top"
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", modules(), ids=named)
 def test_what_a_kernel_is_made_of(path: Path) -> None:
     """What decides whether machine code is stale finds all that Python's own parser finds at the top of modules."""
     found: set[str] = set()
-    waiting = {path.stem}
+    waiting = {named(path)}
     while waiting:
         found.add(name := waiting.pop())
-        names = {m.split(".")[1] for m, top in imports(PACKAGE / f"{name}.py") if top and m.startswith("tsdf.")}
-        waiting |= {name for name in names if (PACKAGE / f"{name}.py").is_file()} - found
-    assert imported(path.stem) == found
+        at_top = {m[5:] for m, top in imports(PACKAGE.joinpath(*name.split(".")).with_suffix(".py")) if top}
+        waiting |= (at_top & NAMES) - found
+    assert imported(named(path)) == found
 
 
 def test_library_does_not_import_the_command_line() -> None:

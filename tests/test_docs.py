@@ -1,7 +1,7 @@
 """The documents say what is so: their code runs, their commands parse, the names in them exist.
 
 Each fenced block is judged by its language, each command by the parser of the command itself, and each option in the
-text by whether a command has it. `docs/cpp.md` is compiled in tests/test_cpp.py as well; here its names are.
+text by whether a command has it. `docs/cpp.md` is compiled in tests/loaders/test_cpp.py as well; here its names are.
 """
 
 import json
@@ -22,9 +22,10 @@ import click
 import numpy as np
 import pytest
 
-from tsdf import container, scene
+from tsdf.data import container
 from tsdf.reference_data import make_golden
 from tsdf.reference_data.make_checks import CHECKS
+from tsdf.scene import scene
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [*ROOT.glob("*.md"), *ROOT.glob("*/*.md"), *ROOT.glob("reference_data/golden/*.md")]

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tsdf import image, render, world
-from tsdf.scene import Camera, EnvironmentLight, Scene, Sphere, SurfaceSpec
+from tsdf.picture import image, render, world
+from tsdf.scene.scene import Camera, EnvironmentLight, Scene, Sphere, SurfaceSpec
 
 RED, GREEN, BLUE = np.eye(3)
 

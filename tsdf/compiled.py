@@ -24,7 +24,7 @@ from numba.core import caching, cpu, event, types
 from tsdf.files import whole
 
 PACKAGE = Path(__file__).parent
-_IMPORTS = re.compile(r"^from tsdf(?:\.(\w+) import|\simport\s([^(\n]+|\([^)]*\)))", re.MULTILINE)
+_IMPORTS = re.compile(r"^from tsdf((?:\.\w+)*) import\s+([^(\n]+|\([^)]*\))", re.MULTILINE)
 
 
 def njit(**options: Any) -> Callable[[Any], Any]:
@@ -55,17 +55,25 @@ def _any(kind: Any) -> Any:
 
 @cache
 def imported(name: str) -> frozenset[str]:
-    """Return the names of the modules of the package that a module is made of: itself, and all that it imports."""
+    """Return the names of the modules of the package that a module is made of: itself, and all that it imports.
+
+    Names are dotted and without the package's own: ``walk.memory``.
+    """
     found, waiting = set(), [name]
     while waiting:
         one = waiting.pop()
-        path = PACKAGE / f"{one}.py"
-        if one in found or not path.is_file():
+        if one in found or not _file(one).is_file():
             continue
         found.add(one)
-        for module, names in _IMPORTS.findall(path.read_text(encoding="utf-8")):
-            waiting += [module] if module else re.findall(r"(\w+)(?:\s+as\s+\w+)?\s*(?:,|\)|$)", names)
+        for inside, names in _IMPORTS.findall(_file(one).read_text(encoding="utf-8")):
+            each = re.findall(r"(\w+)(?:\s+as\s+\w+)?\s*(?:,|\)|$)", names)
+            waiting += [inside[1:], *(f"{inside}.{word}".lstrip(".") for word in each)]
     return frozenset(found)
+
+
+def _file(name: str) -> Path:
+    """Return the file of a module of this name, whether there is one or not."""
+    return PACKAGE.joinpath(*name.split(".")).with_suffix(".py")
 
 
 @cache
@@ -76,7 +84,7 @@ def stamp(name: str) -> str:
     """
     digest = hashlib.sha256()
     for one in sorted(imported(name) | imported("compiled") | imported("handle")):
-        digest.update(hashlib.sha256((PACKAGE / f"{one}.py").read_bytes()).digest())
+        digest.update(hashlib.sha256(_file(one).read_bytes()).digest())
     return digest.hexdigest()
 
 
@@ -133,7 +141,9 @@ class _Stamped:
 
     def get_source_stamp(self) -> Any:
         path = Path(self._py_file)
-        return stamp(path.stem) if path.parent == PACKAGE else super().get_source_stamp()  # type: ignore[misc]
+        if not path.is_relative_to(PACKAGE):
+            return super().get_source_stamp()  # type: ignore[misc]
+        return stamp(".".join(path.relative_to(PACKAGE).with_suffix("").parts))
 
 
 class _Given(_Stamped, caching.UserProvidedCacheLocator):

@@ -1,0 +1,247 @@
+"""``tsdf-render`` as a user meets it: what it writes, when it stops, what it refuses, and what Ctrl-C leaves."""
+
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import pytest
+from click.testing import CliRunner, Result
+
+from tsdf.cli import common
+from tsdf.cli.render import main
+from tsdf.picture import image
+from tsdf.reference_data.make_checks import CHECKS
+
+WIDTH, HEIGHT = 12, 8
+SCENE = f"""
+[camera]
+position = [0.0, -9.0, 0.0]
+target = [0.0, 0.0, 0.0]
+fov_deg = 30.0
+exposure = -1.0
+width = {WIDTH}
+height = {HEIGHT}
+[render]
+spp = 3
+seed = 5
+[[light]]
+type = "constant"
+radiance = [1.0, 0.5, 0.25]
+[[medium]]
+packing_fraction = 0.4
+radius = 0.05
+shape = {{ type = "sphere", centre = [0.0, 0.0, 0.0], radius = 1.5 }}
+[[medium.grain]]
+table = "cube.tsdf.exr"
+absorption = [2.0, 2.0, 4.0]
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ball of absorbing grains before a bright sky."""
+    folder = tmp_path_factory.mktemp("render")
+    shutil.copy(CHECKS / "cube.tsdf.exr", folder)
+    (folder / "scene.toml").write_text(SCENE)
+    return folder
+
+
+def run(folder: Path, *words: object, out: str = "p.exr") -> Result:
+    words = (folder / "scene.toml", "--out", folder / out, *words)
+    return CliRunner().invoke(main, [str(word) for word in words], prog_name="tsdf-render")
+
+
+def facts(path: Path) -> dict:
+    return json.loads(image.read_exr(path).attributes["tsdf_render"])
+
+
+def test_what_is_written(folder: Path) -> None:
+    """The picture and its variance, how it was made, and the same developed beside it."""
+    result = run(folder)
+    assert (result.exit_code, result.stderr) == (0, "")
+    picture = image.read_exr(folder / "p.exr")
+    assert picture.rgb.shape == picture.variance.shape == (HEIGHT, WIDTH, 3)
+    assert (picture.variance >= 0.0).all() and np.isfinite(picture.variance).all()
+    assert np.allclose(picture.rgb[0, 0], (1.0, 0.5, 0.25))  # the sky beside the ball, without noise
+    assert (picture.rgb[HEIGHT // 2, WIDTH // 2] < (0.9, 0.45, 0.225)).all()
+    said = facts(folder / "p.exr")
+    assert said == said | {"level": "teleport", "samples": [3, 3], "seed": 5, "truncated": 0, "faults": 0}
+    assert said["scene"].endswith("scene.toml") and said["events"] > 0 and said["software"].startswith("tsdf")
+    with PIL.Image.open(folder / "p.png") as png:
+        assert (png.size, png.mode) == ((WIDTH, HEIGHT), "RGB")
+        levels = np.asarray(png, float)
+    linear = np.clip(picture.rgb / 2.0, 0.0, 1.0)  # one stop darker
+    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
+    assert np.abs(levels - 255.0 * srgb).max() <= 0.51
+    line = r"p\.exr: holds 3 samples per pixel, level teleport, relative error \S+, \S+ s, \S+ grain events per second"
+    assert re.search(line, result.stdout)
+    quiet = run(folder, "--quiet", out="q.exr")
+    assert (quiet.exit_code, quiet.output) == (0, "")
+    assert (folder / "q.exr").read_bytes() == (folder / "p.exr").read_bytes()
+    assert (folder / "q.png").read_bytes() == (folder / "p.png").read_bytes()
+
+
+def test_the_same_for_any_number_of_threads(folder: Path) -> None:
+    for threads in (1, 3):
+        assert run(folder, "--threads", threads, "--seed", 7, out=f"{threads}.exr").exit_code == 0
+    assert (folder / "1.exr").read_bytes() == (folder / "3.exr").read_bytes()
+    run(folder, "--threads", 1, "--seed", 8, out="other.exr")
+    assert not np.array_equal(image.read_exr(folder / "1.exr").rgb, image.read_exr(folder / "other.exr").rgb)
+
+
+def test_options(folder: Path) -> None:
+    assert run(folder, "--width", 6, "--level", "isotropic", "--spp", 2, "--seed", 9, out="O.EXR").exit_code == 0
+    said = facts(folder / "O.EXR")
+    assert (said["level"], said["samples"], said["seed"]) == ("isotropic", [2, 2], 9)
+    assert image.read_exr(folder / "O.EXR").rgb.shape == (4, 6, 3) and (folder / "O.png").is_file()
+
+
+def test_stops(folder: Path) -> None:
+    """By the clock, or once the error is small enough: then it is, and was not with a quarter of the samples."""
+    begun = time.monotonic()
+    assert run(folder, "--seconds", 0.3, out="s.exr").exit_code == 0
+    assert time.monotonic() - begun > 0.2 and facts(folder / "s.exr")["samples"][0] >= 1
+    result = run(folder, "--target-error", 0.05, out="e.exr")
+    assert result.exit_code == 0
+    picture = image.read_exr(folder / "e.exr")
+    assert np.sqrt(picture.variance.mean()) / picture.rgb.mean() <= 0.05
+    low, high = facts(folder / "e.exr")["samples"]
+    assert low == high > 3
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        (["--spp", "0"], 2, "--spp"),
+        (["--width", "0"], 2, "--width"),
+        (["--width", "100000"], 2, "width"),
+        (["--threads", "0"], 2, "--threads"),
+        (["--threads", "100000"], 2, "--threads"),
+        (["--seed", "-1"], 2, "--seed"),
+        (["--seed", str(2**63)], 2, "--seed"),
+        (["--seconds", "0"], 2, "--seconds"),
+        (["--seconds", "nan"], 2, "--seconds"),
+        (["--target-error", "inf"], 2, "--target-error"),
+        (["--spp", "1", "--seconds", "1"], 2, "give one"),
+        (["--level", "teleprot"], 2, "--level"),
+        (["--level", "teleport-memory"], 1, "--memory"),
+        (["--out", "a.png"], 2, ".exr"),
+        (["--out", "/no/such/folder/a.exr"], 1, "not a folder"),
+        (["--out", ""], 2, ".exr"),
+    ],
+)
+def test_bad_requests(words: list[str], status: int, said: str, folder: Path, tmp_path: Path) -> None:
+    result = run(folder, *words, out=str(tmp_path / "x.exr"))
+    assert result.exit_code == status and result.stdout == "" and result.stderr.count("\n") == 1, result.output
+    assert result.stderr.startswith("tsdf-render: error: ") and said in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bad_scenes(folder: Path, tmp_path: Path) -> None:
+    for name, text, said in (
+        ("a", "[camera", "not TOML"),
+        ("b", SCENE.replace("cube.tsdf.exr", "none.exr"), "none.exr"),
+        ("c", SCENE.replace("cube.tsdf.exr", "scene.toml"), "scene.toml"),
+    ):
+        (folder / f"{name}.toml").write_text(text)
+        result = CliRunner().invoke(main, [str(folder / f"{name}.toml"), "--out", str(tmp_path / "x.exr")])
+        assert result.exit_code == 1 and result.stderr.count("\n") == 1 and said in result.stderr, result.output
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_picture_stays_until_there_is_a_whole_new_one(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(folder, out="kept.exr")
+    before = {name: (folder / name).read_bytes() for name in ("kept.exr", "kept.png")}
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("tsdf.files.os.replace", full)
+        result = run(folder, "--seed", 1, out="kept.exr")
+    assert result.exit_code == 1 and "No space left" in result.stderr
+    assert {name: (folder / name).read_bytes() for name in before} == before
+    assert not list(folder.glob(".*"))
+
+
+# --- interrupts and progress --------------------------------------------------------
+
+
+def begin(folder: Path, out: Path, *words: object) -> subprocess.Popen:
+    """Start to render without end, with a line of progress whenever there is any."""
+    code = "import tsdf.cli.common as c; c.EVERY_S = c.LEAST_S = 0.0; from tsdf.cli.render import main; main()"
+    command = [sys.executable, "-c", code, folder / "scene.toml", "--out", out, "--spp", 10**8, "--threads", 1, *words]
+    return subprocess.Popen([str(word) for word in command], stdout=-1, stderr=-1, text=True)
+
+
+@pytest.mark.parametrize(("number", "times"), [(signal.SIGINT, 1), (signal.SIGTERM, 2)])
+def test_an_interrupt_writes_the_picture_so_far(number: int, times: int, folder: Path, tmp_path: Path) -> None:
+    """One signal or two at once, as `timeout` sends them: the picture, its PNG, one line, 128 + the signal."""
+    out = tmp_path / "i.exr"
+    with begin(folder, out) as process:
+        for line in process.stderr:
+            if re.match(r"\d+ %, [1-9]\d* spp ", line):
+                break
+        for _ in range(times):
+            process.send_signal(number)
+        said, rest = process.communicate(timeout=60)
+    assert process.returncode == 128 + number
+    assert said.count("\n") == 1 and "interrupted: holds" in said and "error" not in rest
+    low, high = facts(out)["samples"]
+    assert high >= max(low, 1) and np.isfinite(image.read_exr(out).rgb).all()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["i.exr", "i.png"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_before_anything_ends_at_once(number: int, folder: Path, tmp_path: Path) -> None:
+    with begin(folder, tmp_path / "i.exr", "--quiet") as process:
+        while not int(re.search("SigCgt:\t(.*)", Path(f"/proc/{process.pid}/status").read_text())[1], 16) >> 14 & 1:
+            time.sleep(0.001)  # until SIGTERM is caught
+        begun = time.monotonic()
+        process.send_signal(number)
+        said, rest = process.communicate(timeout=60)
+    assert process.returncode == 128 + number and time.monotonic() - begun < 2.0
+    assert said == "" and rest.count("\n") == 1 and rest.startswith("tsdf-render: error: interrupted")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_progress(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A line a minute where there is no terminal; a kernel that is compiled is said to be."""
+    clock = [0.0]
+    monkeypatch.setattr(common.time, "monotonic", lambda: clock[0])
+    progress = common.Progress()
+    for second in range(200):
+        clock[0] = float(second)
+        progress(second / 200.0, f"{second} spp")
+    assert capsys.readouterr().err == "30 %, 60 spp [1:00]\n60 %, 120 spp [2:00]\n90 %, 180 spp [3:00]\n"
+    monkeypatch.setattr("tsdf.compiled.compiling", lambda: True)
+    clock[0] = 260.0
+    progress.show()
+    assert capsys.readouterr().err == "100 %, compiling, once for this machine [4:20]\n"
+    quiet = common.Progress(quiet=True)
+    clock[0] = 1000.0
+    quiet(0.5, "word")
+    quiet.note("note")
+    assert capsys.readouterr().err == ""
+
+
+def test_a_reader_who_is_gone_costs_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Standard error is a pipe that nobody reads any more."""
+
+    def gone(*_: object, **__: object) -> None:
+        raise BrokenPipeError
+
+    for name in ("EVERY_S", "LEAST_S"):
+        monkeypatch.setattr(common, name, 0.0)
+    progress = common.Progress()
+    with monkeypatch.context() as patch:
+        patch.setattr(common.click, "echo", gone)
+        progress(0.5, "word")
+        progress.note("note")

@@ -1,0 +1,193 @@
+"""Where things are: distances against brute force, bounds that are bounds, media that are refused."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numba import njit
+
+from tsdf.errors import SceneError
+from tsdf.grain.grains import load_grain
+from tsdf.grain.optics import Optics
+from tsdf.make import scatterometer
+from tsdf.make.scatterometer import Effort
+from tsdf.scene.scene import Box, Camera, ConstantLight, GrainSpec, MediumSpec, Mesh, Scene, Slab, Sphere, SurfaceSpec
+from tsdf.walk import geometry
+from tsdf.walk.geometry import clearance, exact_hit
+from tsdf.walk.grid import cells_of
+from tsdf.walk.room import BALL, BOX, SLAB, exact_depth, triangle_distance
+
+SHAPES = ((SLAB, (0.0, 0.0, -1.0, 0.0, 0.0, 2.0)), (BOX, (-1.0, -2.0, -0.5, 1.5, 1.0, 0.7)),
+          (BALL, (0.3, -0.2, 0.1, 1.5, 0.0, 0.0)))  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def table():
+    return scatterometer.exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=16))
+
+
+def placed(table, *shapes, surfaces=()):
+    """Return the geometry of media of grains of radius 0.1."""
+    media = tuple(MediumSpec(shape, 0.5, 0.1, (GrainSpec(table),), name=f"m{i}") for i, shape in enumerate(shapes))
+    camera = Camera((9.0, 0.0, 0.0), (0.0, 0.0, 0.0), 2, 2)
+    return geometry.place(Scene(camera, (ConstantLight((1.0, 1.0, 1.0)),), media, surfaces))
+
+
+def directions(rng, n):
+    d = rng.normal(size=(n, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize(("kind", "shape"), SHAPES)
+def test_exact_hit_is_where_the_depth_changes_sign(kind, shape):
+    """Along the ray the depth keeps its sign up to the distance found and has the other beyond: independent of how the
+    distance is found. Rays along the axes are among them; where nothing is met, the sign never changes."""
+    rng = np.random.default_rng(0)
+    s = np.array(shape)
+    ways = directions(rng, 400)
+    ways[:60] = np.eye(3)[rng.integers(0, 3, 60)] * rng.choice([-1.0, 1.0], (60, 1))
+    met = 0
+    for p, d in zip(rng.uniform(-3.0, 3.0, (400, 3)), ways, strict=True):
+        t, inside, n = exact_hit(kind, s, tuple(p), tuple(d))
+        assert inside == (exact_depth(kind, s, tuple(p)) > 0.0)
+        far = min(t, 20.0)
+        signs = [exact_depth(kind, s, tuple(p + x * d)) > 0.0 for x in np.linspace(0.0, far * (1.0 - 1e-9), 200)]
+        assert all(sign == inside for sign in signs)
+        if t < math.inf:
+            met += 1
+            assert abs(exact_depth(kind, s, tuple(p + t * d))) < 1e-9
+            assert (exact_depth(kind, s, tuple(p + (t + 1e-7) * d)) > 0.0) != inside or abs(np.dot(n, d)) < 1e-3
+            assert (np.dot(n, d) > 0.0) == inside
+            assert math.isclose(np.linalg.norm(n), 1.0)
+    assert met > 50
+
+
+@pytest.mark.parametrize(("kind", "shape"), SHAPES)
+def test_exact_hit_from_the_boundary_itself(kind, shape):
+    """From a point on the boundary a ray inward enters at once and a ray outward never comes back."""
+    s = np.array(shape)
+    p = (s[0] + s[3], s[1], s[2]) if kind == BALL else (0.5, 0.2, s[5])
+    out = (1.0, 0.0, 0.0) if kind == BALL else (0.0, 0.0, 1.0)
+    assert exact_hit(kind, s, p, out)[0] in (0.0, math.inf)
+    t, inside, _ = exact_hit(kind, s, p, tuple(-x for x in out))
+    assert (t == 0.0 and not inside) or inside
+
+
+def test_rays_along_a_slab_never_leave_it():
+    """A flight along a slab has no end, whether it is inside or not."""
+    s = np.array(SHAPES[0][1])
+    assert exact_hit(SLAB, s, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0))[:2] == (math.inf, True)
+    assert exact_hit(SLAB, s, (0.0, 0.0, 3.0), (1.0, 0.0, 0.0))[:2] == (math.inf, False)
+
+
+def brute_distance(corners, p, n=60):
+    """Return the distance from p to the nearest of n^2 points of a triangle, and how far those may miss."""
+    a, b = np.meshgrid(*(np.linspace(0.0, 1.0, n),) * 2)
+    a, b = a[a + b <= 1.0 + 1e-12], b[a + b <= 1.0 + 1e-12]
+    points = corners[0] + a[:, None] * (corners[1] - corners[0]) + b[:, None] * (corners[2] - corners[0])
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).max()
+    return float(np.linalg.norm(points - p, axis=1).min()), longest / (n - 1)
+
+
+def test_triangle_distance_against_samples():
+    """The distance is never above that to any of the triangle's points, nor below it by more than their spacing."""
+    rng = np.random.default_rng(1)
+    for corners, p in zip(rng.normal(size=(300, 3, 3)), 2.0 * rng.normal(size=(300, 3)), strict=True):
+        found = triangle_distance(corners, tuple(p))
+        sampled, spacing = brute_distance(corners, p)
+        assert sampled - spacing <= found <= sampled + 1e-12
+
+
+@pytest.mark.parametrize("width", [1e-4, 1e-7, 1e-9, 1e-12])
+def test_triangle_distance_to_needles(width):
+    """Of needles, whose two long edges are parallel in float64, the distance is right to within their width."""
+    rng = np.random.default_rng(2)
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, width, 0.0]])
+    for p in [*rng.normal(size=(200, 3)), np.array([0.5, 0.0, 0.3]), np.array([0.5, 0.0, 0.0])]:
+        rest = np.array([p[0] - min(max(p[0], 0.0), 1.0), p[1], p[2]])
+        assert abs(triangle_distance(corners, tuple(p)) - np.linalg.norm(rest)) <= 2.0 * width + 1e-12
+
+
+@pytest.fixture(scope="module")
+def bumpy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the file of a closed mesh with a dent and facets of many sizes."""
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(2, radius=2.0)
+    mesh.vertices *= (1.0 - 0.4 * (mesh.vertices[:, :1] > 1.2)) * (1.0 + 0.1 * np.sin(5.0 * mesh.vertices[:, 1:2]))
+    path = tmp_path_factory.mktemp("meshes") / "bumpy.ply"
+    mesh.export(path)
+    return path
+
+
+@njit
+def exact_distances(corners, points, nearest):
+    """Lower (n,) `nearest` to the distances of points (n, 3) to any of the triangles (m, 3, 3)."""
+    for i in range(points.shape[0]):
+        p = (points[i, 0], points[i, 1], points[i, 2])
+        for t in range(corners.shape[0]):
+            nearest[i] = min(nearest[i], triangle_distance(corners[t], p))
+
+
+@pytest.mark.parametrize("shape", ["mesh", "slab", "box"])
+def test_clearance_is_a_bound(shape, bumpy, table):
+    """At 3000 places of each medium nothing is nearer than the clearance, by exact distances to every facet; most
+    places have some. Exact distances halved fail, so the test can see a bound that is no bound."""
+    thing = Mesh(bumpy, 0.3, (0.3, 0.2, 0.1))
+    medium = {"mesh": Mesh(bumpy), "slab": Slab(-2.0, 2.0), "box": Box((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))}[shape]
+    made = placed(table, medium, surfaces=(SurfaceSpec(thing, (0.5,) * 3), SurfaceSpec(Sphere((1.0, 0.0, 0.0), 0.2),
+                  (0.5,) * 3)))  # fmt: skip
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-2.5, 2.5, (9000, 3)) * ((3.0, 3.0, 1.0) if shape == "slab" else (1.0, 1.0, 1.0))
+    points = points[made.inside(0, points)][:3000]
+    meshes = [m for m in (*made.boundaries, *made.surfaces) if m is not None]
+    true = np.full(len(points), math.inf)
+    exact_distances(np.concatenate([m.vertices[m.faces] for m in meshes]), points, true)
+    centre = made.arrays.balls[0]
+    true = np.minimum(true, np.abs(np.linalg.norm(points - centre[:3], axis=1) - centre[3]))
+    if shape != "mesh":
+        kind, s = made.arrays.kind[0], made.arrays.shape[0]
+        true = np.minimum(true, [exact_depth(kind, s, tuple(p)) for p in points])
+    bound = np.array([clearance(made.arrays, 0, tuple(p)) for p in points])
+    assert (bound <= true * (1.0 + 1e-6)).all()
+    assert (bound > 0.5 * true).mean() > 0.5
+    assert not (bound <= 0.5 * true).all()
+
+
+def test_distances_bound_those_of_each_cell(bumpy, table):
+    """No cell's number is above its centre's distance to the nearest facet, nor short by two diagonals of a cell."""
+    made = placed(table, Mesh(bumpy))
+    corners = made.boundaries[0].vertices[made.boundaries[0].faces]
+    for step in (0.05, 0.2):
+        counts = np.array([int(5.2 / step)] * 3)
+        low = np.full(3, -2.6)
+        found = cells_of(corners, geometry.planes_of(corners), low, step, counts)[0]
+        at = np.random.default_rng(4).integers(0, counts, (2000, 3))
+        true = np.full(len(at), math.inf)
+        exact_distances(corners, low + step * (at + 0.5), true)
+        cells = found[tuple(at.T)]
+        assert (cells <= true * (1.0 + 1e-6)).all()
+        assert (true - cells < 2.0 * math.sqrt(3.0) * step).all()
+
+
+def test_overlap_is_refused_and_touching_is_not(bumpy, table):
+    """Media that share room are refused in one line with a place; media that only share a face are not."""
+    low, high = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), Box((0.0, 0.0, 1.0), (1.0, 1.0, 2.0))
+    placed(table, low, high)
+    placed(table, low, Sphere((0.5, 0.5, -1.0), 1.0))
+    for other in (Box((0.5, 0.5, 0.5), (2.0, 2.0, 2.0)), Sphere((0.5, 0.5, 0.5), 0.1), Slab(0.2, 0.4), Mesh(bumpy)):
+        with pytest.raises(SceneError, match=r"overlap, at \(") as error:
+            placed(table, low, other)
+        assert "\n" not in str(error.value)
+
+
+def test_open_boundary_is_refused(tmp_path, bumpy, table):
+    """A medium whose boundary has a hole has no inside: one line that names the medium and the file."""
+    import trimesh
+
+    mesh = trimesh.load(bumpy)
+    trimesh.Trimesh(mesh.vertices, mesh.faces[1:], process=False).export(tmp_path / "open.ply")
+    with pytest.raises(SceneError, match=r"\[\[medium\]\] 1 \(m0\).*open\.ply") as error:
+        placed(table, Mesh(tmp_path / "open.ply"))
+    assert "\n" not in str(error.value)

@@ -1,0 +1,115 @@
+"""What rays meet through the grid, against every facet looked at, the ray engine, and rays that aim at edges."""
+
+import math
+
+import numpy as np
+import pytest
+from numba import njit
+
+from tsdf.grain.grains import first_hit, load_grain, triangle_scene
+from tsdf.walk.geometry import planes_of
+from tsdf.walk.grid import OUTSIDE, Grid, compared, grid_of, march, plane_hit
+
+RAYS = 4000
+THICK = 1e-6
+
+
+@njit
+def marched(grid, p, d, end, met, known):
+    for i in range(p.shape[0]):
+        known[i] = march(grid, met[i], (p[i, 0], p[i, 1], p[i, 2]), (d[i, 0], d[i, 1], d[i, 2]), end[i])
+
+
+@njit
+def looked_at(grid, p, d, end, met):
+    for i in range(p.shape[0]):
+        for facet in range(grid.corners.shape[0]):
+            compared(grid, met[i], facet, (p[i, 0], p[i, 1], p[i, 2]), (d[i, 0], d[i, 1], d[i, 2]), end[i])
+
+
+def rays(grid: Grid, p: np.ndarray, d: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first facets (n, meshes) and whether they are known."""
+    met, known = np.zeros((len(p), int(grid.mesh.max()) + 1), np.int32), np.zeros(len(p), bool)
+    marched(grid, p, d, end, met, known)
+    return met, known
+
+
+def directions(rng: np.random.Generator, n: int) -> np.ndarray:
+    d = rng.normal(size=(n, 3))
+    return np.asarray(d / np.linalg.norm(d, axis=1, keepdims=True))
+
+
+def ball(subdivisions: int = 2, radius: float = 1.0) -> np.ndarray:
+    """Return the corners of a ball of facets, dented so that rays meet it up to four times."""
+    grain = load_grain("icosphere", subdivisions=subdivisions)
+    points = grain.vertices * (1.0 - 0.5 * np.exp(-8.0 * (grain.vertices[:, 2:] - 1.0) ** 2))
+    return np.asarray(radius * points[grain.faces])
+
+
+def made(*meshes: np.ndarray, cells: int = 3000, half: float = 1.1) -> Grid:
+    planes = planes_of(np.concatenate(meshes))
+    box = np.full(3, -half), np.full(3, half)
+    return grid_of(meshes, planes, np.full(len(planes), THICK), box, cells, 0.0, False)
+
+
+def floor(z: float, size: float) -> np.ndarray:
+    a, b, c, d = ((x * size, y * size, z) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
+    return np.array([[a, b, c], [a, c, d]], np.float64)
+
+
+@pytest.mark.parametrize("cells", [1, 60, 3000, 200_000])
+def test_first_facets(cells: int) -> None:
+    """A dented ball over a floor that reaches far out of the grid: from anywhere, near and far, and short."""
+    grid = made(floor(-1.0, 50.0), ball(), cells=cells)
+    rng = np.random.default_rng(1)
+    p, d = rng.uniform(-1.5, 1.5, (RAYS, 3)), directions(rng, RAYS)
+    d[:50] = np.eye(3)[rng.integers(0, 3, 50)] * rng.choice([-1.0, 1.0], (50, 1))  # along the axes
+    end = np.where(rng.random(RAYS) < 0.5, math.inf, rng.exponential(0.3, RAYS))
+    met, known = rays(grid, p, d, end)
+    true = np.full_like(met, -1)
+    looked_at(grid, p, d, end, true)
+    assert known.mean() > 0.9 and (true >= 0).any(axis=0).all() and (true < 0).any(axis=0).all()
+    # The first of all is found, and whatever else is found is the first of its mesh
+    t = np.array([[plane_hit(grid.planes, f, tuple(a), tuple(b))[0] if f >= 0 else math.inf for f in row]
+                  for row, a, b in zip(true, p, d, strict=True)])  # fmt: skip
+    first, row = t.argmin(axis=1), np.arange(RAYS)
+    sure = known & (t[row, first] < math.inf)
+    assert (met[row, first] == true[row, first])[sure].all()
+    others = known & (np.sort(t, axis=1)[:, 1] < math.inf)
+    assert ((met == true) | (met == -1) | (t > end[:, None]))[known].all() and others.any()
+
+
+def test_as_the_ray_engine() -> None:
+    """Embree names the same facets, but for rays that pass an edge within its rounding."""
+    corners = ball(3)
+    grid = made(corners, cells=20_000)
+    rng = np.random.default_rng(2)
+    p, d = (x.astype(np.float32) for x in (rng.uniform(-1.5, 1.5, (RAYS, 3)), directions(rng, RAYS)))
+    engine = triangle_scene(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3).astype(np.int32))
+    met, known = rays(grid, p.astype(float), d.astype(float), np.full(RAYS, math.inf))
+    same = met[known, 0] == first_hit(engine, p, d)[known]
+    assert same.mean() > 0.999
+
+
+def test_none_slips_through_edges() -> None:
+    """From within a closed mesh, rays at the very vertices and at middles of edges leave through some facet."""
+    corners = ball()
+    grid = made(corners)
+    aims = np.concatenate((corners.reshape(-1, 3), corners.mean(axis=1), 0.5 * (corners[:, 0] + corners[:, 1])))
+    for start in ((0.0, 0.0, 0.0), (0.1, 0.05, -0.2)):
+        p = np.tile(start, (len(aims), 1))
+        d = aims - p
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        met, known = rays(grid, p, d, np.full(len(aims), math.inf))
+        assert known.all()
+        assert (met[:, 0] >= 0).all()
+
+
+def test_what_reaches_out_of_the_grid() -> None:
+    """Much of it is left to the ray engine where a ray leaves the grid, and only there."""
+    grid = made(ball(2, 3.0), cells=500)
+    assert len(grid.outer) == 0 and not grid.closed and len(grid.corners) > OUTSIDE
+    d = np.array([[1.0, 0.0, 0.0]] * 2)
+    known = rays(grid, np.zeros((2, 3)), d, np.array([0.5, math.inf]))[1]
+    assert known.tolist() == [True, False]
+    assert rays(made(floor(-1.0, 50.0)), np.zeros((2, 3)), d, np.array([0.5, math.inf]))[1].all()

@@ -1,0 +1,1 @@
+"""How a table is made: rays, tallies, statistics, and the run that keeps them."""

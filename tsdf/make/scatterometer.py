@@ -1,0 +1,733 @@
+"""How a table is made: a grain, its optics and an effort in, a `Table` out.
+
+Paths are numbered, and all counts are integers that add up in any order, so the same request gives the same bytes for
+any number of threads, interrupted and resumed or not, in one piece or in parts merged afterwards. What counts is only
+which paths are done; the counts go to a part file beside the output every few seconds, and it serves whatever request
+they can answer. Whether a target is met is judged at numbers of paths that follow from the counts alone. `crew` has the
+threads.
+"""
+
+import json
+import math
+import shlex
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tsdf import archive
+from tsdf.data.table import Table
+from tsdf.errors import GrainError, TSDFError, UsageError
+from tsdf.grain.grains import Grain
+from tsdf.grain.optics import Optics
+from tsdf.make import estimate
+from tsdf.make import tally as T
+from tsdf.make.crew import PIECE, Crew, Round
+from tsdf.make.exact import exact_table
+from tsdf.make.tally import Tally
+from tsdf.make.tracer import MAX_BOUNCES
+
+DEFAULT_PATHS = 4_000_000
+DEFAULT_CELLS = 256
+MIN_PATHS = 16 * T.REPLICATES  # fewer give no honest standard error
+MAX_PATHS = 1 << 36  # 6.9e10: 2^30 in each replicate, whose energy times path length stays below 2^63
+MAX_JOINT = 1024
+MAX_LEAK = 1e-4  # share of the light that may be lost or cut off before a grain is refused
+CHUNK_MIN, CHUNK_MAX = 1 << 13, 1 << 20
+REASONABLE = 10**10  # paths that a target may take; a day of two processors
+ROUND_S, SAVE_S = 1.0, 5.0  # how long a round of the threads should last, and the least between two saves [s]
+PART_VERSION = 3
+PART_LIMIT = 1 << 28  # bytes of a part file; with all the records there can be it has 2e8
+
+Spans = list[tuple[int, int]]  # first and last + 1 path number of each, ascending, none touching the next
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much to trace and what to keep.
+
+    Parameters
+    ----------
+    paths : int, optional
+        Number of paths, MIN_PATHS .. MAX_PATHS; DEFAULT_PATHS unless there is a target.
+    target_error : float, optional
+        Stop when the estimated total variation of p_theta is this small; in (0, 1).
+    cells : int, optional
+        Cells of theta, MIN_CELLS .. MAX_CELLS; DEFAULT_CELLS, or with a target the fewest that meet it.
+    joint : int
+        Joint records per cell of theta, 0 .. MAX_JOINT.
+    seed : int
+        0 .. 2^63 - 1.
+    max_bounces : int
+        Hits after which a path is cut off.
+    memory : int
+        Records per cell of entry_b2, 0 .. MAX_JOINT; there are as many cells as columns.
+
+    Raises
+    ------
+    UsageError
+        If a value is out of range.
+    """
+
+    paths: int | None = None
+    target_error: float | None = None
+    cells: int | None = None
+    joint: int = 0
+    seed: int = 0
+    max_bounces: int = MAX_BOUNCES
+    memory: int = 0
+
+    def __post_init__(self) -> None:
+        if self.paths is not None and not (MIN_PATHS <= self.paths <= MAX_PATHS):
+            raise UsageError(
+                f"the number of paths must be {MIN_PATHS} to {MAX_PATHS:.2g}, got {self.paths:.6g}: errors are told "
+                f"from {T.REPLICATES} independent samples, and counts must stay exact"
+            )
+        if self.target_error is not None and not (0.0 < self.target_error < 1.0):
+            raise UsageError(f"the target error is a total variation between 0 and 1, got {self.target_error:g}")
+        if self.paths is not None and self.target_error is not None:
+            raise UsageError("give a number of paths or a target error, not both")
+        if self.cells is not None and not (estimate.MIN_CELLS <= self.cells <= estimate.MAX_CELLS):
+            raise UsageError(
+                f"the cells of theta must be {estimate.MIN_CELLS} to {estimate.MAX_CELLS}, got {self.cells}"
+            )
+        if not (0 <= self.joint <= MAX_JOINT):
+            raise UsageError(f"the joint records per cell must be 0 to {MAX_JOINT}, got {self.joint}")
+        if not (0 <= self.memory <= MAX_JOINT):
+            raise UsageError(f"the records per cell of entry must be 0 to {MAX_JOINT}, got {self.memory}")
+        if not (0 <= self.seed < 1 << 63):
+            raise UsageError(f"the seed must be 0 to 2^63 - 1, got {self.seed}")
+        if not (1 <= self.max_bounces <= 10**9):
+            raise UsageError(f"the bounce limit must be 1 to 1e9, got {self.max_bounces}")
+
+    def resolved(self) -> "Effort":
+        """Return the effort with its defaults filled in."""
+        values = asdict(self)
+        if self.target_error is None:
+            values["paths"] = self.paths or DEFAULT_PATHS
+            values["cells"] = self.cells or DEFAULT_CELLS
+        return Effort(**values)
+
+
+def chunks(paths: int | None) -> Iterator[tuple[int, int]]:
+    """Yield the first and last + 1 path number of each chunk: an eighth of what is done, within limits, forever
+    unless the number of paths is given."""
+    end = MAX_PATHS if paths is None else paths
+    first = 0
+    while first < end:
+        size = min(max(first // 8 // CHUNK_MIN * CHUNK_MIN, CHUNK_MIN), CHUNK_MAX)
+        yield first, min(first + size, end)
+        first += size
+
+
+def joined(spans: Iterable[tuple[int, int]]) -> Spans:
+    """Return spans in order, those that touch as one."""
+    whole: Spans = []
+    for first, last in sorted(spans):
+        if whole and first <= whole[-1][1]:
+            whole[-1] = (whole[-1][0], max(last, whole[-1][1]))
+        else:
+            whole.append((first, last))
+    return whole
+
+
+def without(spans: Spans, done: Spans) -> Spans:
+    """Return what of `spans` is not in `done`."""
+    left, k = [], 0
+    for first, last in spans:
+        while k < len(done) and done[k][1] <= first:
+            k += 1
+        for begin, end in done[k:]:
+            if begin >= last:
+                break
+            if begin > first:
+                left.append((first, begin))
+            first = max(first, end)
+        if first < last:
+            left.append((first, last))
+    return left
+
+
+def beginning(spans: Spans, paths: int) -> Spans:
+    """Return the first so many paths of `spans`."""
+    found = []
+    for first, last in spans:
+        if paths <= 0:
+            break
+        found.append((first, min(last, first + paths)))
+        paths -= last - first
+    return found
+
+
+def size(spans: Iterable[tuple[int, int]]) -> int:
+    """Return how many paths there are."""
+    return sum(last - first for first, last in spans)
+
+
+def printable(text: str) -> str:
+    """Return text from outside as one line that a header can hold; file names may have line breaks in them."""
+    return text if text.isprintable() else ascii(text)[1:-1]
+
+
+GRAIN = {"kind", "name", "parameters", "notes"}  # what is asked of a grain that a part file describes
+
+
+def grain_header(grain: Grain) -> dict[str, Any]:
+    """Return the header's account of a grain."""
+    return {
+        "kind": grain.kind,
+        "name": printable(grain.name),
+        "parameters": dict(grain.parameters),
+        "bounding_radius": float(grain.bounding_radius),
+        "area": float(grain.area),
+        "volume": float(grain.volume),
+        "convex": bool(grain.convex),
+        "bodies": max(1, int(grain.bodies)),
+        "faces": len(grain.faces),
+        "mesh_sha256": grain.mesh_hash or None,
+        "notes": [printable(note)[:1000] for note in grain.notes[:256]],
+    }
+
+
+def canonical_command(grain: Mapping[str, Any], optics: Optics, effort: Effort, traced: bool) -> str:
+    """Return the command that makes the same table: no paths of this machine, no threads, no chunks, no target."""
+    words = ["tsdf-build", shlex.quote(grain["name"])]
+    words += ["--repair-any"] if any(note.startswith("repair") for note in grain["notes"]) else []
+    words += [f"--set {key}={value}" for key, value in grain["parameters"].items()]
+    if optics.material is not None:
+        words += [f"--material {shlex.quote(optics.material)}", f"--wavelength-nm {optics.wavelength_nm!r}"]
+    else:
+        words += [f"--eta {optics.eta!r}"]
+    words += [f"--fresnel {optics.fresnel}"] if grain["kind"] == "sphere" else []
+    words += ["--traced"] if traced and grain["kind"] == "sphere" else []
+    if traced:
+        words += [f"--paths {effort.paths}"] if effort.target_error is None else []
+        words += [f"--seed {effort.seed}", f"--max-bounces {effort.max_bounces}"]
+    words += [f"--target-error {effort.target_error!r}"] if effort.target_error is not None else []
+    words += [f"--cells {effort.cells}"] if effort.cells is not None else []
+    words += [f"--joint {effort.joint}"] if effort.joint else []
+    words += [f"--memory {effort.memory}"] if effort.memory else []
+    return " ".join(words)
+
+
+def exact_sphere(grain: Grain, optics: Optics, effort: Effort) -> Table:
+    """Return the table of the exact sphere, by quadrature.
+
+    Raises
+    ------
+    UsageError
+        If the target error is out of reach of any number of cells.
+    """
+    header = grain_header(grain)
+    cells = effort.cells or (None if effort.target_error is not None else DEFAULT_CELLS)
+    provenance = {
+        "method": "exact",
+        "command": canonical_command(header, optics, effort, traced=False),
+        "seed": None,
+        "paths": 0,
+        "max_bounces": None,
+    }
+    return exact_table(cells, effort.target_error, effort.joint, header, optics, provenance, effort.memory)
+
+
+@dataclass
+class Progress:
+    """How far a build has come.
+
+    Attributes
+    ----------
+    paths : int
+        Paths done.
+    total : int, optional
+        Paths that it will take; with a target, as far as can be told.
+    rays : int
+        Rays traced since `Build.run` began.
+    error : TableError, optional
+        Of the table that would be made now.
+    """
+
+    paths: int = 0
+    total: int | None = None
+    rays: int = 0
+    error: estimate.TableError | None = None
+
+
+@dataclass
+class _Pace:
+    """How many paths a round should have: about ROUND_S of work, and no more than there is time for.
+
+    Parameters
+    ----------
+    deadline : float
+        When to stop, on the monotonic clock [s].
+    length : int
+        Paths of a round.
+    rate : float
+        Paths in a second; 0 as long as it is not known [1/s].
+    """
+
+    deadline: float
+    length: int = CHUNK_MIN
+    rate: float = 0.0
+
+    def next(self, under_way: int) -> int:
+        """Return the paths of the next round if so many are under way; 0 if there is no time for more."""
+        if not self.rate or math.isinf(self.deadline):
+            return self.length
+        left = int((self.deadline - time.monotonic()) * self.rate) - under_way
+        return min(self.length, left) if left >= PIECE else 0
+
+    def learn(self, paths: int, seconds: float) -> None:
+        """Take note of how long a round took."""
+        self.rate = paths / max(seconds, 1e-6)
+        if paths == self.length and seconds < 0.5 * ROUND_S:
+            self.length *= 2
+
+
+@dataclass(eq=False)
+class Build:
+    """A table in the making: what was asked for, the paths done and their counts.
+
+    Parameters
+    ----------
+    grain : mapping
+        As in the header, so that a table can be finished without the mesh.
+    optics : Optics
+    effort : Effort
+        Resolved.
+    tally : Tally
+        Holds as many records as the effort asks for, or more.
+    done : list of (int, int)
+        The paths that are in `tally`.
+    judgement : int
+        Number of paths at which it is judged next whether the target is met.
+    """
+
+    grain: dict[str, Any]
+    optics: Optics
+    effort: Effort
+    tally: Tally
+    done: Spans = field(default_factory=list)
+    judgement: int = CHUNK_MIN
+    _latest: tuple[int, estimate.TableError] | None = None
+
+    @classmethod
+    def start(cls, grain: Grain, optics: Optics, effort: Effort) -> "Build":
+        """Return a build of which nothing is done yet."""
+        if grain.kind != "sphere" and optics.fresnel != "un":
+            raise UsageError(
+                "polarisations can only be kept apart for the exact sphere, where each path stays in one plane: "
+                "use --fresnel un for meshes"
+            )
+        effort = effort.resolved()
+        return cls(grain_header(grain), optics, effort, Tally(joint=effort.joint, memory=effort.memory))
+
+    @property
+    def origin(self) -> dict[str, Any]:
+        """What decides what the paths are; they serve every request of the same origin."""
+        return {
+            "part_version": PART_VERSION,
+            "software": estimate.software(),
+            "grain": self.grain,
+            "optics": asdict(self.optics),
+            "seed": self.effort.seed,
+            "max_bounces": self.effort.max_bounces,
+        }
+
+    @property
+    def paths(self) -> int:
+        """Number of paths done."""
+        return size(self.done)
+
+    def take(self, stored: "Build", name: str = "the part file") -> None:
+        """Go on from the paths of another build, of which this one asks perhaps for other cells, paths or target.
+
+        Raises
+        ------
+        TSDFError
+            If they cannot answer this request; the message says what they can.
+        """
+        mine, other = self.origin, stored.origin
+        differing = [key.replace("_", "-") for key in mine if mine[key] != other[key]]
+        for kind in ("joint", "memory"):
+            if getattr(self.effort, kind) > getattr(stored.tally, kind):
+                differing.append(f"--{kind} {getattr(self.effort, kind)}")
+        if differing:
+            raise TSDFError(
+                f"{name} holds {stored.paths} paths of another build (they differ in {', '.join(differing)}): it "
+                "serves its own grain, optics, --seed and --max-bounces, with any --paths, --cells or --target-error, "
+                f"--joint up to {stored.tally.joint} and --memory up to {stored.tally.memory}; to start anew, delete "
+                "it or choose another --out"
+            )
+        self.tally, self.done = stored.tally, stored.done
+        same = (self.effort.target_error, self.effort.cells) == (stored.effort.target_error, stored.effort.cells)
+        self.judgement = stored.judgement if same else 0
+
+    def error(self) -> estimate.TableError | None:
+        """Return the error of the table that would be made now, with the cells it would have."""
+        if not self.tally.scalars[:, T.SCATTERED].any():
+            return None
+        if self._latest is None or self._latest[0] != self.paths:
+            errors, target = estimate.TableErrors(self.tally, self.effort.cells), self.effort.target_error
+            self._latest = self.paths, (errors.fewest(target) if target is not None else None) or errors.best()
+        return self._latest[1]
+
+    def _judge(self, progress: Progress) -> bool:
+        """Tell whether the target is met, and if not, choose when to ask again: never so late that much is wasted.
+
+        Raises
+        ------
+        UsageError
+            If more paths cannot help, or unreasonably many would be needed.
+        """
+        target, paths = self.effort.target_error, self.paths
+        assert target is not None
+        following = next(last for _, last in chunks(None) if last > paths)
+        self.judgement = following
+        if not self.tally.scalars[:, T.SCATTERED].all():
+            return False
+        errors = estimate.TableErrors(self.tally, self.effort.cells)
+        progress.error = errors.fewest(target) or errors.rough()
+        if progress.error.total_variation <= target:
+            progress.total = self.judgement = paths
+            return True
+        least, needed = (times * paths for times in errors.needed(target))
+        sure = progress.error.sampling_noise < 0.5 * target
+        if math.isinf(least) or (sure and least > REASONABLE):
+            finest = errors(self.effort.cells or estimate.MAX_CELLS)
+            more = "allow more --cells, or give" if self.effort.cells else "give"
+            raise UsageError(
+                f"--target-error {target:g} is out of reach"
+                + (f" of {REASONABLE:.0e} paths" if math.isfinite(least) else "")
+                + f": {finest.cells} cells of theta alone cost {finest.cell_width:.2g} of total variation; {more} a "
+                "larger --target-error, or --paths"
+            )
+        progress.total = int(max(needed, following))
+        # halfway to where the target should be met, and not above four times as far, for what is seen early may mislead
+        halfway = min(paths + 0.5 * (needed - paths), 4.0 * paths)
+        self.judgement = next(last for _, last in chunks(None) if last > paths and last >= halfway)
+        return False
+
+    def run(
+        self,
+        grain: Grain,
+        threads: int = 1,
+        part: tuple[int, int] = (1, 1),
+        part_file: Path | None = None,
+        report: Callable[[Progress], None] | None = None,
+        reflectance_scale: float = 1.0,
+        max_seconds: float = math.inf,
+    ) -> None:
+        """Trace the paths that are not done, saving the counts to `part_file` every few seconds and at the end.
+
+        An interrupt lets the threads finish what they are at, for a second at most, and saves it.
+
+        Parameters
+        ----------
+        threads : int
+            Threads that trace.
+        part : (int, int)
+            Only chunks i, i + n, ... of n parts, counting from 1.
+        report : callable
+            Called ten times a second, and at the end.
+        reflectance_scale : float
+            Makes a wrong tracer, to test the tests, see `tracer.Tracer`.
+        max_seconds : float
+            Stop when so much time has passed, with what is done by then; if nothing is, after the first few paths.
+
+        Raises
+        ------
+        GrainError
+            If the grain loses more than MAX_LEAK of the light, told once enough paths are done to be sure.
+        UsageError
+            If the target is out of reach.
+        """
+        progress, leave, tracing, ended = Progress(self.paths), *(threading.Event() for _ in range(3))
+        outcome: list[BaseException] = []
+
+        def work() -> None:
+            try:
+                self._work(grain, threads, part, part_file, progress, report is not None, reflectance_scale,
+                           time.monotonic() + max_seconds, leave, tracing)  # fmt: skip
+            except BaseException as error:
+                outcome.append(error)
+            finally:
+                ended.set()
+
+        # in a thread of its own, so that no signal finds counts half added or a file half written
+        worker = threading.Thread(target=work, daemon=True)
+        try:
+            worker.start()
+            while not ended.wait(0.1):  # not Thread.join, which after an interrupt takes the thread for ended (3.11)
+                if report is not None:
+                    report(progress)
+            if report is not None:
+                report(progress)
+        except BaseException:
+            leave.set()
+            if tracing.is_set():  # else it compiles, and has nothing that could be lost
+                ended.wait()
+            if outcome:
+                raise outcome[0] from None
+            raise
+        if outcome and "start new thread" in str(outcome[0]):
+            raise MemoryError from outcome[0]
+        if outcome:
+            raise outcome[0]
+
+    def _wanted(self, part: tuple[int, int]) -> Spans:
+        """Return the paths that are to be done before anything is judged."""
+        paths = self.effort.paths
+        if part != (1, 1):
+            return [span for k, span in enumerate(chunks(paths)) if k % part[1] == part[0] - 1]
+        if paths is None:
+            paths = self.judgement
+        return [(0, max([paths, *(last for _, last in self.done)]))]
+
+    def _work(
+        self, grain: Grain, threads: int, part: tuple[int, int], part_file: Path | None, progress: Progress,
+        tell: bool, reflectance_scale: float, deadline: float, leave: threading.Event, tracing: threading.Event,
+    ) -> None:  # fmt: skip
+        """Trace in rounds of about ROUND_S, two of them under way, until all is done, met, too late or left."""
+        target = self.effort.target_error
+        if target is None:
+            progress.total = size(self._wanted(part))
+        whole = without(self._wanted(part), self.done) == []
+        late = bool(self.done) and deadline <= time.monotonic()
+        if late or (whole and (target is None or self._judge_and_save(progress, part_file))):
+            progress.error = self.error() if tell and not progress.error else progress.error
+            if part_file is not None:
+                self.save(part_file)
+            return
+        effort, tally = self.effort, self.tally
+        crew = Crew(grain, self.optics, effort.seed, effort.max_bounces, tally.joint, tally.memory, threads,
+                    reflectance_scale)  # fmt: skip
+        tracing.set()
+        under_way: deque[Round] = deque()
+        pace, ahead, before, saved = _Pace(deadline), self.done, time.monotonic(), -math.inf
+        with crew:
+            while True:
+                while len(under_way) < 2 and not leave.is_set():
+                    wanted = self._wanted(part)
+                    if target is not None and wanted == ahead:  # go on while the target is judged
+                        wanted = [(0, next(last for _, last in chunks(None) if last > self.judgement))]
+                    running = sum(size(one.pieces.values()) for one in under_way)
+                    spans = beginning(without(wanted, ahead), pace.next(running))
+                    if not spans:
+                        break
+                    under_way.append(crew.start(spans))
+                    ahead = joined([*ahead, *spans])
+                if not under_way:
+                    break
+                under_way[0].wait(leave)
+                finished = crew.dismiss(under_way, ROUND_S) if leave.is_set() else [under_way.popleft()]
+                if leave.is_set() and target is not None:  # what was traced ahead would be judged, too, and too late
+                    finished = [one for one in finished if max(one.pieces.values())[1] <= self.judgement]
+                for one in finished:
+                    spans, rays = crew.gather(one, tally)
+                    self.done = joined([*self.done, *spans])
+                    progress.rays += rays
+                progress.paths, now = self.paths, time.monotonic()
+                if leave.is_set():
+                    break
+                pace.learn(size(spans), now - before)
+                before = now
+                if target is not None and self.done == self._wanted(part):
+                    if self._judge_and_save(progress, part_file):
+                        break
+                elif tell and target is None:
+                    progress.error = self.error()
+                self.check_leaks()
+                if part_file is not None and now - saved > SAVE_S:
+                    self.save(part_file)
+                    saved = time.monotonic()
+        if part_file is not None and (self.done or not leave.is_set()):
+            self.save(part_file)
+
+    def _judge_and_save(self, progress: Progress, part_file: Path | None) -> bool:
+        """Tell whether the target is met; what is done is safe even if it is out of reach."""
+        try:
+            return self._judge(progress)
+        except UsageError:
+            if part_file is not None:
+                self.save(part_file)
+            raise
+
+    def check_leaks(self) -> None:
+        """Refuse a grain whose tracing loses too much light.
+
+        Raises
+        ------
+        GrainError
+            If the light that was lost at the surface or cut off by the bounce limit is more than MAX_LEAK of what was
+            launched by four standard errors, of rare whole paths.
+        """
+        sums = self.tally.scalars.astype(object).sum(axis=0)
+        launched, lost, cut = sums[T.LAUNCHED], sums[T.LOST], sums[T.TRUNCATED]
+        limit = MAX_LEAK * launched + 4.0 * math.sqrt(MAX_LEAK * launched / T.UNIT) * T.UNIT
+        if lost > limit:
+            raise GrainError(
+                f"{self.grain['name']}: {lost / launched:.2g} of the light was lost at the surface, more than "
+                f"{MAX_LEAK:g}: the mesh leaks or intersects itself; mend it, or try --repair"
+            )
+        if cut > limit:
+            raise GrainError(
+                f"{self.grain['name']}: {cut / launched:.2g} of the light was still inside after "
+                f"{self.effort.max_bounces} bounces, more than {MAX_LEAK:g}: raise --max-bounces"
+            )
+
+    def falls_short(self, part: tuple[int, int] = (1, 1)) -> str | None:
+        """Return what is not as asked for, None if nothing is: paths that are missing, a target that is not met."""
+        target, paths = self.effort.target_error, self.paths
+        if target is None and (missing := size(without(self._wanted(part), self.done))):
+            return f"{paths} of {paths + missing} paths are done"
+        error = self.error() if target is not None else None
+        if error is not None and target is not None and error.total_variation > target:
+            return f"the target error {target:g} is not met after {paths} paths, {error.total_variation:.3g} is"
+        return None
+
+    def table(self, as_it_got: bool = False) -> Table:
+        """Return the finished table.
+
+        Parameters
+        ----------
+        as_it_got : bool
+            Whether fewer paths than asked for, or a target that is not met, will do.
+
+        Raises
+        ------
+        TSDFError
+            If paths are missing, or no light at all was scattered.
+        """
+        paths = self.paths
+        missing = without([(0, max([self.effort.paths or 0, *(last for _, last in self.done)]))], self.done)
+        if not paths or self.done[0] != (0, paths) or (missing and not as_it_got):
+            what = f"{size(missing)} paths of {size(missing) + paths} are missing" if missing else "no paths are done"
+            raise TSDFError(f"{what}: go on with --resume, or give all the parts to tsdf-merge, whole")
+        self.check_leaks()
+        error = self.error()
+        if error is None:
+            raise TSDFError(f"none of {paths} paths was scattered by the grain: trace more (--paths), or look at it")
+        if not as_it_got and (short := self.falls_short()):
+            raise TSDFError(f"{short}: go on with --resume, or with --max-seconds 0 for the table as good as it got")
+        made = replace(self.effort, paths=paths, target_error=None, cells=error.cells)
+        provenance = {
+            "method": "traced",
+            "command": canonical_command(self.grain, self.optics, made, traced=True),
+            "seed": made.seed,
+            "paths": paths,
+            "max_bounces": made.max_bounces,
+        }
+        tally = self.tally.narrowed(made.joint, made.memory)
+        return estimate.traced_table(tally, error.cells, self.grain, self.optics, provenance, made.memory)
+
+    def save(self, path: Path) -> None:
+        """Write the part file, atomically.
+
+        Raises
+        ------
+        TSDFError
+            If it cannot be written; the file that stood there is left as it was.
+        """
+        request = json.dumps({**self.origin, "effort": asdict(self.effort), "judgement": self.judgement})
+        kept: dict[str, np.ndarray] = {
+            archive.PART: np.frombuffer(request.encode(), dtype=np.uint8),
+            "done": np.array(self.done, dtype=np.int64).reshape(-1, 2),
+            "records_kept": np.array([self.tally.joint, self.tally.memory], dtype=np.int64),
+        }
+        archive.write(path, kept | self.tally.arrays())
+
+    @classmethod
+    def load(cls, path: Path) -> "Build":
+        """Read a part file.
+
+        Raises
+        ------
+        TSDFError
+            If it is missing, damaged, or of another version of this software.
+        """
+        try:
+            arrays = archive.read(path, PART_LIMIT)
+            request = json.loads(arrays.pop(archive.PART).tobytes())
+            if (request["part_version"], request["software"]) != (PART_VERSION, estimate.software()):
+                made = printable(str(request["software"]))[:100]
+                raise TSDFError(f"{path}: made by another version ({made}): build it again")
+            kept, done = arrays.pop("records_kept"), arrays.pop("done")
+            if (
+                kept.shape != (2,)
+                or done.ndim != 2
+                or done.shape[1] != 2
+                or {kept.dtype, done.dtype} != {np.dtype(np.int64)}
+            ):
+                raise ValueError("done")
+            joint, memory = (int(k) for k in kept)
+            if not (0 <= joint <= MAX_JOINT and 0 <= memory <= MAX_JOINT):
+                raise ValueError("records_kept")
+            spans = [(int(first), int(last)) for first, last in done]
+            if joined(spans) != spans or any(not 0 <= first < last <= MAX_PATHS for first, last in spans):
+                raise ValueError("done")
+            effort, judgement = request["effort"], request["judgement"]
+            whole = [judgement, *(value for key, value in effort.items() if key != "target_error")]
+            if any(type(value) is not int for value in whole if value is not None) or not 0 <= judgement <= MAX_PATHS:
+                raise ValueError("effort")
+            if effort["joint"] > joint or effort["memory"] > memory or not request["grain"].keys() >= GRAIN:
+                raise ValueError("effort")
+            build = cls(
+                request["grain"], Optics(**request["optics"]), Effort(**effort), Tally(joint, memory), spans, judgement,
+            )  # fmt: skip
+            mine = build.tally.arrays()
+            if mine.keys() != arrays.keys():
+                raise ValueError("arrays")
+            for name, values in mine.items():
+                if arrays[name].shape != values.shape or arrays[name].dtype != values.dtype:
+                    raise ValueError(name)
+                values[...] = arrays[name]
+            build.tally.check(build._launched())
+        except FileNotFoundError:
+            raise TSDFError(f"{path}: no such file") from None
+        except OSError as error:
+            raise TSDFError(f"{path}: {error.strerror or error}") from None
+        except (TSDFError, MemoryError) as error:
+            if isinstance(error, UsageError):
+                raise TSDFError(f"{path}: {error}") from None
+            raise
+        except Exception as error:  # whatever a damaged header leads to
+            reason = "not a whole part file of tsdf-build --chunk or of an interrupted build"
+            raise TSDFError(f"{path}: {reason}: give another, or build this part again") from error
+        return build
+
+    def _launched(self) -> np.ndarray:
+        """Return how many of the paths done each replicate has, (REPLICATES,) int64."""
+        numbers = np.arange(T.REPLICATES)
+        return sum(
+            ((last - numbers + T.REPLICATES - 1) // T.REPLICATES - (first - numbers + T.REPLICATES - 1) // T.REPLICATES
+             for first, last in self.done), np.zeros(T.REPLICATES, np.int64)
+        )  # fmt: skip
+
+
+def merge(paths: list[Path]) -> Build:
+    """Return the build that part files add up to.
+
+    Raises
+    ------
+    TSDFError
+        If they are of different requests or share paths.
+    """
+    whole = Build.load(paths[0])
+    for path in paths[1:]:
+        other = Build.load(path)
+        mine, its = ({**build.origin, **asdict(build.effort)} for build in (whole, other))
+        if its != mine:
+            differing = ", ".join(key.replace("_", "-") for key in mine if mine[key] != its[key])
+            raise TSDFError(f"{path}: a part of another build than {paths[0]} (they differ in {differing})")
+        shared = size(other.done) - size(without(other.done, whole.done))
+        if shared:
+            raise TSDFError(f"{path}: {shared} of its paths are in another part already: give each part once")
+        whole.tally.add(other.tally)
+        whole.done = joined([*whole.done, *other.done])
+    return whole

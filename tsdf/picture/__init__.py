@@ -1,0 +1,1 @@
+"""Scenes made ready, rendered, and written as images."""

@@ -1,0 +1,315 @@
+"""Pictures: samples of pixels shared out over threads, added up in a fixed order, with the variance of each pixel.
+
+How a sample is followed is `transport`, what it is followed through is `world`. A sample's random numbers are a
+function of (seed, pixel, number of the sample), and blocks of samples are the same whatever the number of threads, so
+a picture of so many samples (`spp`) is the same to the last bit for any number of threads; one that the clock stopped
+is not.
+"""
+
+import math
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from tsdf.errors import SceneError, UsageError
+from tsdf.handle import Handle
+from tsdf.picture.world import World, camera_of, sees
+from tsdf.walk import transport as T
+from tsdf.walk import walker as W
+from tsdf.walk.transport import Camera
+
+SLOTS = 2048  # walkers under way at once, per thread, but for shadows: their state stays in the second-level cache
+ROOM = 4 * SLOTS
+BLOCK = 65536  # samples of a block, about: the last few walkers of each wait for the ray engine alone
+LEAST = 4096  # samples of a block, however few are asked for
+PARTS = 16  # of a pass, so that threads have something to share; and of the time, so that it is kept
+FEW = 16  # samples per pixel of a pass of a large picture; the first has one, so that soon no pixel is black
+BLACK = 256  # samples per pixel after which a black picture needs no smaller error
+GROWTH = 8  # of a pass over the one before it, at most, while it is not known how long they take
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A rendered picture and what it took.
+
+    Attributes
+    ----------
+    rgb : (h, w, 3) float64
+        Mean radiance, linear sRGB.
+    variance : (h, w, 3) float64
+        Of that mean, estimated from the samples; infinite with fewer than two.
+    samples : (h, w) int64
+        Samples of each pixel.
+    events, rays : int
+        Grains met, and rays traced in the scene.
+    seconds : float
+        Time spent on it.
+    truncated, faults : int
+        Paths given up because nothing let their light out, and rays that lost track of a surface.
+    interrupted : bool
+        Whether it is less than what was asked for because the user stopped it.
+    """
+
+    rgb: np.ndarray
+    variance: np.ndarray
+    samples: np.ndarray
+    events: int
+    rays: int
+    seconds: float
+    truncated: int
+    faults: int
+    interrupted: bool
+
+    @property
+    def relative_error(self) -> float:
+        """Standard error of pixels (root mean square) over the mean of the picture."""
+        mean = float(self.rgb.mean())
+        if not np.isfinite(self.variance).all() or mean <= 0.0:
+            return math.inf
+        return math.sqrt(float(self.variance.mean())) / mean
+
+
+class Walkers:
+    """What one thread needs to follow light through a world.
+
+    Attributes
+    ----------
+    walkers, amounts : lists of two arrays
+        Walkers under way, and what they were.
+    radiance : (n, 3) float64
+        Found so far by each sample; `reserve` makes room.
+    counters : (4,) int64
+        See `walker.EVENTS`.
+    """
+
+    def __init__(self, world: World) -> None:
+        self.arrays = Handle(
+            T.WorldArrays(
+                world.place.arrays, world.place.room, world.media, world.tables, world.lights, world.packed.arrays,
+                world.memory, world.absorption,
+            )
+        )  # fmt: skip
+        self.place, self.packed = world.place, world.packed
+        engines, exemplars = len(self.place.engines), len(self.packed.engines)
+        self.walkers = [np.zeros(ROOM, W.WALKER) for _ in range(2)]
+        self.amounts = [np.zeros((ROOM, world.amounts)) for _ in range(2)]
+        self.hits = np.full((ROOM + 1, engines), -1, np.int32)
+        self.grain_hits = np.full((exemplars, ROOM), -1, np.int32)
+        self.starts, self.ways = (np.zeros((ROOM, 3), np.float32) for _ in range(2))
+        self.grain_starts, self.grain_ways = (np.zeros((exemplars, ROOM, 3), np.float32) for _ in range(2))
+        self.counters = np.zeros(4, np.int64)
+        self.asked = np.zeros(W.GRAINS_ASKED + exemplars, np.int64)
+        self.radiance = np.zeros((0, 3))
+        self.reserve(1)
+
+    def reserve(self, samples: int) -> None:
+        """Let so many samples have found nothing yet."""
+        if len(self.radiance) < samples:
+            self.radiance = np.zeros((samples, 3))
+            self.batches = [Handle(batch) for batch in (self._batch(0, 1), self._batch(1, 0))]
+        self.radiance[:samples] = 0.0
+
+    def _batch(self, now: int, then: int) -> W.Batch:
+        return W.Batch(
+            self.walkers[now], self.amounts[now], self.walkers[then], self.amounts[then], self.hits, self.grain_hits,
+            self.starts, self.ways, self.grain_starts, self.grain_ways, self.radiance, self.counters, self.asked,
+        )  # fmt: skip
+
+    def follow(self, job: T.Job, pixels: int, stop: threading.Event) -> np.ndarray:
+        """Return the radiance (pixels, spp, 3) of the samples of a job, of so many pixels.
+
+        Once `stop` is set it is worthless.
+        """
+        total = pixels * job.spp
+        self.reserve(total)
+        first, live = 0, 0
+        while (live or first < total) and not stop.is_set():
+            if live <= SLOTS // 2 and first < total:
+                fresh = min(SLOTS - live, total - first)
+                self.spawn(live, job, first, fresh)
+                first, live = first + fresh, live + fresh
+            live = self.turn(live)
+        return self.radiance[:total].reshape(pixels, job.spp, 3).copy()
+
+    def spawn(self, live: int, job: T.Job, first: int, count: int) -> None:
+        """Start walkers, behind the first `live` of ``walkers[0]``, for samples first .. first + count - 1 of a job."""
+        T.spawn(self.batches[0], live, job, first, count)
+
+    def turn(self, live: int) -> int:
+        """Take the first `live` of ``walkers[0]`` as far as they come without the ray engine, ask it, and return how
+        many go on; ``walkers[1]`` then holds what they were, those that have ended as they ended."""
+        T.advance(self.arrays, self.batches[0], live)
+        live, rays = int(self.asked[W.LIVE]), int(self.asked[W.ASKED])
+        if rays:
+            self.place.hits(self.starts[:rays], self.ways[:rays], self.hits.T)
+        for e, asked in enumerate(self.asked[W.GRAINS_ASKED :]):
+            if asked:
+                starts, ways = self.grain_starts[e, :asked], self.grain_ways[e, :asked]
+                self.grain_hits[e, :asked] = self.packed.hits(e, starts, ways)
+        for pair in (self.batches, self.walkers, self.amounts):
+            pair.reverse()
+        return live
+
+
+def render(
+    world: World,
+    spp: int | None = None,
+    seconds: float | None = None,
+    target_error: float | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Callable[[float, str], None] | None = None,
+    stop: threading.Event | None = None,
+) -> Picture:
+    """Return the picture that the scene's camera takes.
+
+    Parameters
+    ----------
+    world : World
+    spp : int, optional
+        Samples per pixel.
+    seconds : float, optional
+        Stop when another pass over all pixels would take longer than this; one is always made.
+    target_error : float, optional
+        Stop when `Picture.relative_error` is below this.
+    seed : int
+        The same seed and number of samples give the same picture for any number of threads.
+    threads : int, optional
+        All processors by default.
+    progress : callable, optional
+        Called with the share done in [0, 1] and a word about it.
+    stop : Event, optional
+        Set by others to end early; the picture then holds the samples so far.
+    """
+    camera = world.scene.camera
+    if not sees(world):
+        raise SceneError(
+            f"{world.scene.name}: a camera looking at nothing: it sees neither a medium nor a surface; move its target"
+        )
+    return measure(
+        world, camera_of(world), camera.width, camera.height, spp, seconds, target_error, seed, threads, progress, stop
+    )
+
+
+def measure(
+    world: World,
+    camera: Camera,
+    width: int = 1,
+    height: int = 1,
+    spp: int | None = None,
+    seconds: float | None = None,
+    target_error: float | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Callable[[float, str], None] | None = None,
+    stop: threading.Event | None = None,
+) -> Picture:
+    """Return the picture that any camera takes, as `render` does for the scene's own; of a parallel beam, say."""
+    if spp is None and seconds is None and target_error is None:
+        raise UsageError("say when to stop: samples per pixel, seconds or a target error")
+    for name, value in (("spp", spp), ("seconds", seconds), ("target error", target_error)):
+        if value is not None and not 0 < value < math.inf:
+            raise UsageError(f"{name} must be a finite number above 0, not {value}")
+    threads = threads or os.cpu_count() or 1
+    stop = stop or threading.Event()
+    halt = threading.Event()
+    count = width * height
+    total, squares = np.zeros((count, 3)), np.zeros((count, 3))
+    samples = np.zeros(count, np.int64)
+    pool = [Walkers(world) for _ in range(threads)]
+    pool[0].follow(T.Job(camera, 0, 1, 0, seed), 1, halt)  # compiles, outside the time
+    for walkers in pool:
+        walkers.counters[:] = 0
+    free = list(pool)
+    begin = time.perf_counter()
+
+    def job(pixel: int, pixels: int, number: int, sample: int) -> np.ndarray:
+        mine = free.pop()
+        try:
+            return mine.follow(T.Job(camera, pixel, number, sample, seed), pixels, halt)
+        finally:
+            free.append(mine)
+
+    def picture(interrupted: bool) -> Picture:
+        n = np.maximum(samples, 1)[:, None]
+        mean = total / n
+        with np.errstate(invalid="ignore", divide="ignore"):
+            variance = np.where(n > 1, np.maximum(squares / n - mean**2, 0.0) / np.maximum(n - 1, 1), math.inf)
+        counters = np.sum([walkers.counters for walkers in pool], axis=0)
+        shape = (height, width, 3)
+        return Picture(
+            mean.reshape(shape), variance.reshape(shape), samples.reshape(height, width), int(counters[W.EVENTS]),
+            int(counters[W.RAYS]), time.perf_counter() - begin, int(counters[W.TRUNCATED]), int(counters[W.FAULTS]),
+            interrupted,
+        )  # fmt: skip
+
+    def following(share: int, took: float) -> int:
+        """Return how many samples per pixel the next pass has, 0 for no next pass; the last one had `share`."""
+        most = max(FEW, PARTS * BLOCK // count)
+        if spp is not None:
+            return min(most if share else 1, spp - done)
+        if seconds is None:
+            return most if share else 1
+        if not share:
+            return 1
+        left = seconds - (time.perf_counter() - begin)
+        each = max(took, 1e-6) / share  # of a pass of one sample
+        return min(max(int(min(left, seconds / PARTS) / each), int(left >= each)), most, GROWTH * share)
+
+    def blocks(share: int) -> Iterator[tuple[int, int, int, int]]:
+        """First pixel, pixels, samples of each and the number of the first, one block of a pass after the other."""
+        size = min(max(share * count // PARTS, LEAST), BLOCK)
+        number = min(share, size)
+        step = max(1, size // number)
+        for sample in range(done, done + share, number):
+            for pixel in range(0, count, step):
+                yield pixel, min(step, count - pixel), min(number, done + share - sample), sample
+
+    done, share, took, reached = 0, 0, 0.0, math.inf
+    waiting: deque[tuple[tuple[int, int, int, int], Future]] = deque()
+    with ThreadPoolExecutor(threads) as executor:
+        try:
+            while not stop.is_set() and (share := following(share, took)) > 0:
+                coming, found, start = blocks(share), 0, time.perf_counter()
+                while not stop.is_set():
+                    while len(waiting) < 2 * threads and (block := next(coming, None)):
+                        waiting.append((block, executor.submit(job, *block)))
+                    if not waiting:
+                        break
+                    (pixel, pixels, number, _), future = waiting[0]
+                    try:
+                        radiance = future.result(timeout=0.1)
+                    except TimeoutError:
+                        continue
+                    waiting.popleft()
+                    total[pixel : pixel + pixels] += radiance.sum(axis=1)
+                    squares[pixel : pixel + pixels] += (radiance**2).sum(axis=1)
+                    samples[pixel : pixel + pixels] += number
+                    found += number * pixels
+                    if progress is not None:
+                        part = (done + found / count) / spp if spp else 0.0
+                        if seconds is not None:
+                            part = min(1.0, (time.perf_counter() - begin) / seconds)
+                        if target_error is not None and done > 1:
+                            part = min(1.0, (target_error / reached) ** 2)
+                        progress(part, f"{done + found // count} spp")
+                else:
+                    break
+                took, done = time.perf_counter() - start, done + share
+                if target_error is not None and done > 1:
+                    reached = max(picture(False).relative_error, 1e-9)
+                    if reached <= target_error:
+                        break
+                if target_error is not None and done >= BLACK and not total.any():
+                    break
+        except KeyboardInterrupt:
+            stop.set()
+        finally:
+            halt.set()
+    return picture(stop.is_set())

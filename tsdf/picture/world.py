@@ -1,0 +1,507 @@
+"""A scene at one level of detail, as the arrays that `transport` follows light through.
+
+Here free paths, phase functions and absorption spectra become numbers per medium and component; how light uses them is
+`transport`, pictures are `render`. The levels, cheapest first: isotropic (point scatterers, similarity), volume-hg (one
+Henyey-Greenstein lobe), volume (tabulated deflections), teleport (Algorithm 1 of Meng et al. 2015), teleport-joint (its
+offsets kept together), teleport-memory (where neighbours are as well), explicit (packed grains, traced).
+"""
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tsdf.data import format
+from tsdf.data.sampler import Tables, compile_tables
+from tsdf.data.table import Table
+from tsdf.errors import SceneError, TSDFError
+from tsdf.grain.grains import first_hit, load_grain
+from tsdf.grain.optics import Optics
+from tsdf.make.scatterometer import Effort, exact_sphere
+from tsdf.picture import image
+from tsdf.scene.levels import LEVELS, Traits
+from tsdf.scene.medium import Component, VolumeParameters, free_path, volume_parameters
+from tsdf.scene.scene import Absorption as AbsorptionSpec
+from tsdf.scene.scene import (
+    Box,
+    ConstantLight,
+    EnvironmentLight,
+    GrainSpec,
+    MediumSpec,
+    Mesh,
+    Scene,
+    Slab,
+    SunLight,
+    absorption_at,
+    called,
+)
+from tsdf.spheres.neighbours import law
+from tsdf.vectors import frame
+from tsdf.walk.explicit import Packed, nothing_packed, packed
+from tsdf.walk.geometry import MESH, Place, Triangles, ball_hit, exact_hit, place
+from tsdf.walk.lights import LUMINANCE, LightArrays, compile_lights
+from tsdf.walk.memory import Memory, memory_of
+from tsdf.walk.transport import Camera
+from tsdf.walk.walker import MAX_EVENTS, Absorption, Media
+
+CAPTIVES = 32  # paths that look for a way out from the camera
+BOUNCES = 500  # after which there is none; a hole of a thousandth of all surfaces is found by then
+SLOW = 1e5  # grains met by a path, beyond which it is said how long that takes
+ENDLESS = 1e7  # beyond which a path takes seconds
+EVENTS_PER_SECOND = 1e7  # of one thread, about
+DARKEST = 1e-300  # albedo, so that it has a logarithm
+FARTHEST = 1e300  # free path where nothing deflects, finite so that 0 of it is 0
+LOOKS = 200  # pixels along each side through which it is looked whether the camera sees anything
+LONGEST_OFFSET = math.sqrt(8.0)  # [R] r and z drawn independently: at most 2 each
+
+
+@dataclass(eq=False)
+class World:
+    """What light meets in a scene at a level.
+
+    Attributes
+    ----------
+    scene : Scene
+    level : str
+    place : Place
+        Geometry and its ray engine.
+    packed : Packed
+        Grains of the explicit level.
+    media, tables, memory, lights, absorption
+        Arrays for kernels.
+    amounts : int
+        How many amounts of matter a walker counts.
+    parameters : tuple of VolumeParameters
+        Of the media, at the luminance-weighted mean of their absorption.
+    notes : tuple of str
+        What the user should know, one line each.
+    """
+
+    scene: Scene
+    level: str
+    place: Place
+    packed: Packed
+    media: Media
+    tables: Tables
+    memory: Memory
+    lights: LightArrays
+    absorption: Absorption
+    amounts: int
+    parameters: tuple[VolumeParameters, ...]
+    notes: tuple[str, ...]
+
+
+def camera_of(world: World) -> Camera:
+    """Return the pinhole camera of a scene for kernels, relative to the scene's centre."""
+    camera = world.scene.camera
+    position = np.array(camera.position) - world.place.centre
+    view = _unit(np.array(camera.target) - np.array(camera.position))
+    right = _unit(np.cross(view, _unit(np.array(camera.up))))
+    down = np.cross(view, right)
+    pixel = 2.0 * math.tan(0.5 * math.radians(camera.fov_deg)) / camera.width
+    corner = view - 0.5 * pixel * (camera.width * right + camera.height * down)
+    still = (0.0, 0.0, 0.0)
+    return Camera(
+        _triple(position), still, still, _triple(corner), _triple(pixel * right), _triple(pixel * down), camera.width
+    )
+
+
+def sees(world: World) -> bool:
+    """Return whether anything of the scene is in the picture, as far as one ray for each of some pixels tells.
+
+    Raises
+    ------
+    SceneError
+        If the camera is shut in by white surfaces, between which paths would go on for ever.
+    """
+    place, camera = world.place, camera_of(world)
+    if _shut_in(world, camera):
+        raise SceneError(
+            f"{world.scene.name}: the camera is shut in by white surfaces, where no light gets and no path ends; "
+            "move it out, open them or make them darker"
+        )
+    width, height = world.scene.camera.width, world.scene.camera.height
+    x, y = ((np.arange(min(n, LOOKS)) + 0.5) * n / min(n, LOOKS) for n in (width, height))
+    ways = np.array(camera.corner) + x[:, None, None] * camera.right + y[None, :, None] * camera.down
+    ways = (ways / np.linalg.norm(ways, axis=2, keepdims=True)).reshape(-1, 3)
+    starts = np.broadcast_to(camera.origin, ways.shape)
+    if any((first_hit(engine, starts, ways) >= 0).any() for engine in place.engines):
+        return True
+    g = place.arrays
+    exact = [m for m in range(len(g.kind)) if g.kind[m] != MESH]
+    for d in map(_triple, ways):
+        if len(g.balls) and ball_hit(g.balls, camera.origin, d)[1] >= 0:
+            return True
+        for m in exact:
+            t, inside, _ = exact_hit(g.kind[m], g.shape[m], camera.origin, d)
+            if inside or t < math.inf:
+                return True
+    return False
+
+
+def _shut_in(world: World, camera: Camera) -> bool:
+    """Return whether paths from the camera neither leave the scene nor end, if media were clear; by following some."""
+    place, g = world.place, world.place.arrays
+    if not world.scene.surfaces:
+        return False
+    rng = np.random.default_rng(0)
+    ways = rng.normal(size=(CAPTIVES, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    points = np.tile(np.array(camera.origin), (CAPTIVES, 1))
+    brightest = g.reflectance.max(axis=1)
+    for _ in range(BOUNCES):
+        distance, normal, owner = np.full(len(points), np.inf), np.zeros((len(points), 3)), np.full(len(points), -1)
+        if g.solid:
+            facet = first_hit(place.engines[0], points, ways)
+            met = np.flatnonzero(facet >= 0)
+            plane = g.grid.planes[facet[met]]
+            cosine = np.einsum("ij,ij->i", plane[:, :3], ways[met])
+            distance[met] = (plane[:, 3] - np.einsum("ij,ij->i", plane[:, :3], points[met])) / cosine
+            normal[met], owner[met] = plane[:, :3], g.surface[facet[met]]
+        for i in range(len(points) if len(g.balls) else 0):
+            t, b = ball_hit(g.balls, _triple(points[i]), _triple(ways[i]))
+            if b >= 0 and t < distance[i]:
+                distance[i], owner[i] = t, g.ball_surface[b]
+                normal[i] = _unit(points[i] + t * ways[i] - g.balls[b, :3])
+        if (owner < 0).any():
+            return False
+        goes_on = rng.random(len(points)) < brightest[owner]
+        if not goes_on.any():
+            return False
+        points, ways, distance, normal = (v[goes_on] for v in (points, ways, distance, normal))
+        normal *= -np.sign(np.einsum("ij,ij->i", normal, ways))[:, None]
+        points = points + distance[:, None] * ways
+        points += 1e-6 * (np.abs(points).max(axis=1, keepdims=True) + distance[:, None]) * normal
+        ways = normal + _units(rng.normal(size=normal.shape))  # a cosine-weighted direction
+        ways = _units(ways)
+    return True
+
+
+def _units(v: np.ndarray) -> np.ndarray:
+    units: np.ndarray = v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30)
+    return units
+
+
+def beam(world: World, origin: ArrayLike, direction: ArrayLike, width: float = 0.0) -> Camera:
+    """Return a camera whose one pixel is a parallel beam, a square of given width about `origin` [unit]."""
+    d = np.asarray(direction, np.float64) / np.linalg.norm(direction)
+    a, b = (width * np.array(v) for v in frame(_triple(d)))
+    start = np.asarray(origin, np.float64) - world.place.centre - 0.5 * (a + b)
+    still = (0.0, 0.0, 0.0)
+    return Camera(_triple(start), _triple(a), _triple(b), _triple(d), still, still, 1)
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    """Return a vector at unit length, however short or long."""
+    v = v / np.abs(v).max()
+    unit: np.ndarray = v / np.linalg.norm(v)
+    return unit
+
+
+def _triple(v: np.ndarray) -> tuple[float, float, float]:
+    return float(v[0]), float(v[1]), float(v[2])
+
+
+def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
+    """Return a scene ready to be rendered at a level.
+
+    Parameters
+    ----------
+    scene : Scene
+    level : str
+    limit : int
+        Grains met after which a path is given up.
+
+    Raises
+    ------
+    SceneError, FormatError, UsageError
+        In one line, for whatever makes the scene impossible at that level.
+    """
+    if level not in LEVELS:
+        raise SceneError(f"{scene.name}: no level {level!r}; levels are {', '.join(LEVELS)}")
+    traits = LEVELS[level].traits
+    read: dict[str, Table] = {}
+
+    def table_of(spec: GrainSpec) -> Table:
+        if isinstance(spec.table, Table):
+            return spec.table
+        file = os.path.realpath(spec.table)  # each file once, by whatever name
+        if file not in read:
+            read[file] = format.read(spec.table)
+        return read[file]
+
+    tables = [table_of(grain) for medium in scene.media for grain in medium.grains]
+    made = place(scene, grains=traits.placed)
+    notes = list(made.notes)
+    media, absorption, parameters = _media(scene, traits, tables, limit)
+    if records := LEVELS[level].records:
+        for grain, table in zip((g for m in scene.media for g in m.grains), tables, strict=True):
+            if not getattr(table, records.block):
+                raise SceneError(
+                    f"{scene.name}: {grain.table} has no {records.name}, which level {level} draws from; "
+                    f"build it with {records.option}"
+                )
+    memory = _memory(scene, tables if traits.remembers else [])
+    for number, (medium, boundary) in enumerate(zip(scene.media, made.boundaries, strict=True), 1):
+        extent = _extent(medium, boundary.vertices if boundary is not None else None)
+        if 2.0 * medium.radius > extent and medium.inside == "grains":
+            notes.append(
+                f"{scene.name}: {called('medium', number, medium.name)}: a grain of diameter {2.0 * medium.radius:g} "
+                f"does not fit into the medium, which is {extent:.3g} thin"
+            )
+    notes += _long_paths(scene, traits, tables, made, parameters, limit)
+    lights, said = _lights(scene)
+    notes += said
+    if traits.packed and scene.media and lights.sampled:
+        notes.append(
+            f"{scene.name}: level explicit meets suns and small bright lights by chance alone: until many samples "
+            "have, the picture is too dark and its variance does not tell; widen the sun or light by a smooth sky"
+        )
+    grains = packed(scene, tables) if traits.packed and scene.media else nothing_packed(len(scene.media), len(tables))
+    return World(
+        scene=scene,
+        level=level,
+        place=made,
+        packed=grains,
+        media=media,
+        tables=compile_tables(tables or [_no_table()], joint=traits.joint),
+        memory=memory,
+        lights=lights,
+        absorption=absorption,
+        amounts=len(absorption.least),
+        parameters=parameters,
+        notes=(*notes, *grains.notes),
+    )
+
+
+def _memory(scene: Scene, tables: list[Table]) -> Memory:
+    """Return what level teleport-memory remembers, of nothing where there are no tables."""
+    if not tables:
+        return memory_of([], [], [], [])
+    laws, grains, at = [], [], 0
+    for number, medium in enumerate(scene.media, 1):
+        own = tables[at : at + len(medium.grains)]
+        at += len(own)
+        try:
+            laws.append(law(medium.packing_fraction))
+        except TSDFError as error:
+            raise SceneError(f"{scene.name}: {called('medium', number, medium.name)}: {error}") from None
+        grains.append([(table, grain.fraction) for grain, table in zip(medium.grains, own, strict=True)])
+    fractions = [medium.packing_fraction for medium in scene.media]
+    return memory_of(laws, fractions, [medium.radius for medium in scene.media], grains)
+
+
+def grains_met(
+    medium: MediumSpec, boundary: Triangles | None, inside: bool, extinction: float, transport: float
+) -> float:
+    """Return about how many lossless grains a path meets in a medium in the mean, from a camera outside or inside it.
+
+    The mean path through a body is its mean chord 4 V/S, whatever it scatters (Blanco & Fournier 2003); from the middle
+    of a ball out it is 9/32 of that squared over the transport mean free path, by diffusion.
+
+    Parameters
+    ----------
+    medium : MediumSpec
+    boundary : Triangles or None
+        Where the medium is bounded by a mesh.
+    inside : bool
+        Whether the camera is in the medium.
+    extinction, transport : float
+        Extinction coefficient [1/unit] and transport mean free path [unit].
+    """
+    chord = mean_chord(medium, boundary)
+    return max(chord, 9.0 / 32.0 * chord * chord / transport if inside else 0.0) * extinction
+
+
+def mean_chord(medium: MediumSpec, boundary: Triangles | None) -> float:
+    """Return the mean chord 4 V/S of a medium [unit], by its mesh where it has one."""
+    shape = medium.shape
+    if isinstance(shape, Slab):
+        return 2.0 * (shape.high - shape.low)
+    if isinstance(shape, Box):
+        return float(2.0 / (1.0 / (np.array(shape.high) - np.array(shape.low))).sum())
+    if isinstance(shape, Mesh):
+        assert boundary is not None
+        a, b, c = boundary.vertices[boundary.faces].swapaxes(0, 1)
+        area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+        return float(4.0 / 6.0 * abs(np.einsum("ij,ij->i", a, np.cross(b, c)).sum()) / area)
+    return 4.0 / 3.0 * shape.radius
+
+
+def _long_paths(
+    scene: Scene, traits: Traits, tables: list[Table], place: Place, parameters: Sequence[VolumeParameters], limit: int
+) -> list[str]:
+    """Return what is to be said of media in which paths meet very many grains; SceneError where they hardly end."""
+    notes, at = [], 0
+    camera = np.array(scene.camera.position) - place.centre
+    for m, (medium, volume) in enumerate(zip(scene.media, parameters, strict=True)):
+        own = list(zip(medium.grains, tables[at : at + len(medium.grains)], strict=True))
+        at += len(own)
+        grains = [Component(table, grain.fraction, medium.radius) for grain, table in own]
+        extinction = free_path(grains, medium.packing_fraction).sigma_t
+        if traits.similar and volume.albedo > 0.0:
+            extinction *= 1.0 - volume.g
+        inside = bool(place.inside(m, camera[None])[0])
+        events = grains_met(medium, place.boundaries[m], inside, extinction, volume.transport_mean_free_path)
+        kept = max(
+            table.albedo(_least(grain.absorption, scene.metres_per_unit) * medium.radius) / max(table.albedo(), DARKEST)
+            for grain, table in own
+        )
+        events = min(events, 1.0 / max(1.0 - kept, DARKEST), limit)  # absorption ends paths
+        title = called("medium", m + 1, medium.name)
+        where = f"{scene.name}: {title}: light meets about {events:.1g} grains in the mean"
+        if not events <= ENDLESS:
+            raise SceneError(
+                f"{where} on its way through, which would take minutes a path; take larger grains, a smaller medium or "
+                "a lower packing fraction"
+            )
+        if events > SLOW:
+            pixels = scene.camera.width * scene.camera.height
+            notes.append(
+                f"{where} on its way through: a sample of each of the {pixels} pixels takes about "
+                f"{pixels * events / EVENTS_PER_SECOND:.1g} s of one thread"
+            )
+    return notes
+
+
+def _extent(medium: MediumSpec, vertices: np.ndarray | None) -> float:
+    """Return the smallest extent of a medium along the axes."""
+    shape = medium.shape
+    if isinstance(shape, Slab):
+        return shape.high - shape.low
+    if isinstance(shape, Box):
+        return float((np.array(shape.high) - np.array(shape.low)).min())
+    if isinstance(shape, Mesh):
+        assert vertices is not None
+        return float(np.ptp(vertices, axis=0).min())
+    return 2.0 * shape.radius
+
+
+def _no_table() -> Table:
+    """Return a table for scenes without media, whose kernels want one."""
+    return exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=8, joint=1))
+
+
+def _lights(scene: Scene) -> tuple[LightArrays, list[str]]:
+    """Return the lights of a scene, and what is to be said of its environment."""
+    constant, suns, environment, rotation = np.zeros(3), [], None, 0.0
+    notes: list[str] = []
+    for light in scene.lights:
+        if isinstance(light, ConstantLight):
+            constant += light.radiance
+        elif isinstance(light, SunLight):
+            suns.append((light.direction, light.angular_diameter_deg, light.irradiance))
+        elif isinstance(light, EnvironmentLight):
+            if environment is not None:
+                raise SceneError(f"{scene.name}: more than one environment light; add the images into one file")
+            environment, said = image.read_environment(light.file)
+            environment *= light.scale
+            rotation = light.rotation_deg
+            notes += [f"{scene.name}: {note}" for note in said]
+    try:
+        return compile_lights(constant, environment, rotation, suns), notes
+    except TSDFError as error:
+        raise SceneError(f"{scene.name}: {error}") from None
+
+
+def _least(spec: AbsorptionSpec, metres_per_unit: float | None) -> float:
+    """Return the least absorption coefficient of any wavelength or channel [1/unit]."""
+    by_wavelength, by_channel = _spectra(spec, metres_per_unit)
+    return float(by_channel.min() if by_wavelength is None else by_wavelength.min())
+
+
+def _spectra(spec: AbsorptionSpec, metres_per_unit: float | None) -> tuple[np.ndarray | None, np.ndarray]:
+    """Return the absorption coefficient by wavelength (k,) or None, and by channel (3,), zero where by wavelength."""
+    if spec.kind == "grey":
+        return None, np.full(3, spec.coefficient[0])
+    if spec.kind == "rgb":
+        return None, np.array(spec.coefficient)
+    return absorption_at(spec, image.spectral_weights().wavelength_nm, metres_per_unit), np.zeros(3)
+
+
+def _media(
+    scene: Scene, traits: Traits, tables: list[Table], limit: int
+) -> tuple[Media, Absorption, tuple[VolumeParameters, ...]]:
+    """Return media, absorption and volume parameters, with amounts only for what absorbs."""
+    specs = [(medium, grain) for medium in scene.media for grain in medium.grains]
+    spectra = [_spectra(grain.absorption, scene.metres_per_unit) for _, grain in specs]
+    coloured = any(by_wavelength is not None for by_wavelength, _ in spectra)
+    weight = image.spectral_weights().weight if coloured else np.zeros((0, 3))
+    absorbs = [by_channel.any() or (s is not None and s.any()) for s, by_channel in spectra]
+
+    free, reach, first, kinds, travel, parameters = [], [], [], [], [], []
+    choice, scale, slots, g = [], [], [], []
+    columns: list[tuple[np.ndarray, np.ndarray]] = []  # exponents by wavelength and by channel of each amount
+
+    def amount(by_wavelength: np.ndarray | None, by_channel: np.ndarray) -> int:
+        columns.append((np.zeros(len(weight)) if by_wavelength is None else by_wavelength, by_channel))
+        return len(columns) - 1
+
+    at = 0
+    for medium in scene.media:
+        these = range(at, at + len(medium.grains))
+        components = [Component(tables[i], specs[i][1].fraction, medium.radius) for i in these]
+        grey = [
+            float(np.array(LUMINANCE) @ (by_channel if s is None else weight.T @ s))
+            for s, by_channel in (spectra[i] for i in these)
+        ]
+        path = free_path(components, medium.packing_fraction)
+        volume = volume_parameters(components, medium.packing_fraction, grey)
+        parameters.append(volume)
+        first.append(at)
+        kinds.append(len(components))
+        choice += list(np.cumsum(path.choice))
+        mean_cosine = volume.g if volume.albedo > 0.0 else 0.0  # where no light leaves a grain any will do
+        g += [mean_cosine] * len(components)
+        if traits.similar:
+            free.append(1.0 / max(volume.sigma_t * (1.0 - mean_cosine), 1.0 / FARTHEST))
+        else:
+            free.append(path.lambda_beta if traits.spheres else 1.0 / volume.sigma_t)
+        reach.append(LONGEST_OFFSET * medium.radius if traits.jumps else 0.0)
+        flown_wavelength, flown_channel = np.zeros(len(weight)), np.zeros(3)
+        for i, probability in zip(these, path.choice, strict=True):
+            scale.append(1.0 if traits.points else medium.radius)
+            if not absorbs[i]:
+                slots.append(-1)
+                continue
+            by_wavelength, by_channel = spectra[i]
+            if traits.points:
+                lossless = tables[i].albedo()
+                spectrum = np.zeros(0) if by_wavelength is None else by_wavelength
+                kept = [
+                    np.array([max(tables[i].albedo(s * medium.radius) / lossless, DARKEST) for s in values])
+                    for values in (spectrum, by_channel)
+                ]
+                slots.append(amount(np.log(kept[0]) if by_wavelength is not None else None, np.log(kept[1])))
+                if by_wavelength is not None:
+                    flown_wavelength -= probability * volume.sigma_t * mean_cosine * (1.0 - kept[0])
+                flown_channel -= probability * volume.sigma_t * mean_cosine * (1.0 - kept[1])
+            else:
+                slots.append(amount(None if by_wavelength is None else -by_wavelength, -by_channel))
+        absorbing = any(absorbs[i] for i in these)
+        travel.append(amount(flown_wavelength, flown_channel) if traits.similar and absorbing else -1)
+        at += len(components)
+    spectral = np.array([c[0] for c in columns]).T.reshape(len(weight), len(columns))
+    rgb = np.array([c[1] for c in columns]).T.reshape(3, len(columns))
+    least = rgb.max(axis=0) + (spectral.max(axis=0) if len(weight) else 0.0)
+    media = Media(
+        traits=traits,
+        free=np.array(free),
+        reach=np.array(reach),
+        first=np.array(first, np.int64),
+        kinds=np.array(kinds, np.int64),
+        travel=np.array(travel, np.int64),
+        choice=np.array(choice),
+        scale=np.array(scale),
+        slot=np.array(slots, np.int64),
+        g=np.array(g),
+        limit=limit,
+    )
+    absorption = Absorption(
+        spectral=np.ascontiguousarray(spectral), rgb=np.ascontiguousarray(rgb), weight=np.ascontiguousarray(weight),
+        least=np.ascontiguousarray(least),
+    )  # fmt: skip
+    return media, absorption, tuple(parameters)

@@ -1,0 +1,1 @@
+"""What is asked for: levels, media and scene files, without a kernel."""

@@ -1,0 +1,1 @@
+"""What stands between grains: packings of spheres, and the law of the gaps."""

@@ -1,0 +1,1 @@
+"""Errors and times: experiments, accuracy, comparisons, charts."""

@@ -1,0 +1,1 @@
+"""Kernels: how light walks through media, level by level."""

@@ -1,0 +1,309 @@
+"""Grains one by one, the truth that every model is measured against: a packing of bounding spheres, a grain in each.
+
+A medium is filled by a periodic tile of spheres (`packing`), in which a grain stands where there is room (`room`).
+Which exemplar it is and how it is turned are functions of its place. Light enters a bounding sphere, is brought into
+the grain's frame, and goes one way at each hit, as in nature. The exact sphere is followed here without a ray engine;
+all other grains share one ray-engine scene for each exemplar.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tsdf.compiled import njit
+from tsdf.data.table import Table
+from tsdf.errors import SceneError, TSDFError
+from tsdf.grain.grains import Grain, embree_scene, grain_from_mesh, load_grain
+from tsdf.grain.meshes import read_mesh
+from tsdf.grain.optics import OFFSET, UNPOLARISED, P, S, fresnel, nearer, on_plane, parted, sound
+from tsdf.sampling import GOLDEN, key_of, mix, turn, unit
+from tsdf.scene.scene import GrainSpec, Scene, called
+from tsdf.spheres.packing import Cells, cells_of, next_sphere, pack
+from tsdf.vectors import KERNEL, dot, renewed, step, triple
+from tsdf.walk.geometry import planes_of
+from tsdf.walk.room import stands
+from tsdf.walk.walker import write
+
+EXACT_SPHERE = -1
+ENTERED, INSIDE, RETRIED, LEFT = 0, 1, 2, 4
+
+
+class Grains(NamedTuple):
+    """What kernels ask about packed grains. The first two are tuples over media, the rest arrays.
+
+    cells, centres: the tile's grid and its (n, 3) centres [R]; radius (m,): R [unit]; seed (m,) uint64. Of components:
+    share (c,): running sum of number fractions in each medium; eta, kept_apart (c,) (the polarisations), exemplar (c,)
+    int32: ray-engine scene. Of the exemplars' facets: planes (f, 4), centroids (f, 3), first_facet (e,).
+    """
+
+    cells: tuple[Cells, ...]
+    centres: tuple[np.ndarray, ...]
+    radius: np.ndarray
+    seed: np.ndarray
+    share: np.ndarray
+    eta: np.ndarray
+    kept_apart: np.ndarray
+    exemplar: np.ndarray
+    planes: np.ndarray
+    centroids: np.ndarray
+    first_facet: np.ndarray
+
+
+# ------------------------------------------------------------------------------------------- for kernels
+
+
+@njit(**KERNEL)
+def centre_of(grains, m, i, j, k, sphere):
+    """Return the centre of a sphere of tile (i, j, k) of medium m [unit]."""
+    side, c, radius = grains.cells[m].side, grains.centres[m], grains.radius[m]
+    return (
+        radius * (c[sphere, 0] + side * i),
+        radius * (c[sphere, 1] + side * j),
+        radius * (c[sphere, 2] + side * k),
+    )
+
+
+@njit(**KERNEL)
+def next_grain(grains, room, m, p, d, t_max):
+    """Return distance to the next grain's bounding sphere along d from p [unit] or infinity, its centre and its key."""
+    r = grains.radius[m]
+    o = (p[0] / r, p[1] / r, p[2] / r)
+    t = 0.0
+    while True:
+        t, i, j, k, sphere = next_sphere(grains.cells[m], o, d, t, t_max / r)
+        if sphere < 0:
+            return math.inf, o, np.uint64(0)
+        centre = centre_of(grains, m, i, j, k, sphere)
+        if stands(room, m, centre):
+            tile = key_of(grains.seed[m], (i + 1048576) * 2097152 + (j + 1048576), k + 1048576)
+            return t * r, centre, mix(tile + np.uint64(sphere))
+
+
+@njit(**KERNEL)
+def turned(key, v, back):
+    """Return a triple turned by the uniformly random rotation (Shoemake 1992) of a grain's key, or turned back."""
+    u = unit(mix(key + np.uint64(1)))
+    c1, s1 = turn(unit(mix(key + np.uint64(2))))
+    c2, s2 = turn(unit(mix(key + np.uint64(3))))
+    a, b = math.sqrt(1.0 - u), math.sqrt(u)
+    x, y, z, w = a * s1, a * c1, b * s2, b * c2
+    if back:
+        x, y, z = -x, -y, -z
+    tx = 2.0 * (y * v[2] - z * v[1])
+    ty = 2.0 * (z * v[0] - x * v[2])
+    tz = 2.0 * (x * v[1] - y * v[0])
+    return (
+        v[0] + w * tx + y * tz - z * ty,
+        v[1] + w * ty + z * tx - x * tz,
+        v[2] + w * tz + x * ty - y * tx,
+    )
+
+
+@njit(**KERNEL)
+def component_of(grains, first, count, key):
+    """Return the component of a grain, by number fraction."""
+    u = unit(mix(key + np.uint64(4)))
+    c = first
+    while c < first + count - 1 and u >= grains.share[c]:
+        c += 1
+    return c
+
+
+@njit(**KERNEL)
+def through_sphere(p, d, eta, kept_apart, key):
+    """Follow light that meets the unit sphere at p until it leaves; return place, direction, length inside, key."""
+    cos_i = min(-dot(p, d), 1.0)
+    polarisation = UNPOLARISED
+    if kept_apart:
+        key = mix(key + GOLDEN)
+        polarisation = S if key & np.uint64(1) else P
+    reflectance, cos_t = fresnel(cos_i, eta, polarisation)
+    key = mix(key + GOLDEN)
+    if unit(key) < reflectance:
+        return p, step(d, 2.0 * cos_i, p), 0.0, key
+    length = 0.0
+    d = step((d[0] / eta, d[1] / eta, d[2] / eta), cos_i / eta - cos_t, p)
+    while True:
+        p = step(p, 2.0 * cos_t, d)
+        size = 1.0 / math.sqrt(dot(p, p))
+        p = (p[0] * size, p[1] * size, p[2] * size)
+        length += 2.0 * cos_t
+        key = mix(key + GOLDEN)
+        if unit(key) >= reflectance:
+            d = step((eta * d[0], eta * d[1], eta * d[2]), cos_i - eta * cos_t, p)
+            return p, d, length, key
+        d = step(d, -2.0 * dot(d, p), p)
+
+
+@njit(**KERNEL)
+def at_facet(grains, w, facet):
+    """Take a walker in a grain's frame to the facet that the ray engine found, -1 for none, and on: its facet, its key
+    and where its next ray starts, off the facet along its normal.
+
+    Returns
+    -------
+    p, d : triples
+        Where it is and the way it goes on, both as they were if the same ray is to be repeated from nearer the middle
+        of the facet it came from.
+    length : float
+        Travelled inside [R].
+    state : int
+        INSIDE, RETRIED and LEFT (the light left the grain for good) as bits.
+    fault : bool
+        The light was inside and met nothing, twice: it is set free where it is.
+    """
+    p, d, eta, last = triple(w.p), triple(w.d), grains.eta[w.component], w.facet
+    write(w.e, p)
+    inside = (w.state & INSIDE) != 0
+    if facet < 0 and not inside:
+        w.facet = facet
+        return p, d, 0.0, LEFT, False
+    n, cosine, t = (0.0, 0.0, 0.0), 0.0, math.inf
+    if facet >= 0:
+        n, cosine, t = on_plane(grains.planes[facet], p, d)
+    if not sound(cosine, t, inside):
+        if last < 0 or w.state & RETRIED:
+            w.facet = facet
+            return p, d, 0.0, LEFT, inside
+        write(w.e, nearer(grains.centroids[last], p))
+        return p, d, 0.0, w.state | RETRIED, False
+    t = max(t, 0.0)
+    p = step(p, t, d)
+    length = t if inside else 0.0
+    reflectance, mirrored, refracted = parted(d, n, cosine, 1.0 / eta if inside else eta, UNPOLARISED)
+    w.key = mix(w.key + GOLDEN)
+    if unit(w.key) < reflectance:
+        d = mirrored
+    else:
+        d, inside = refracted, not inside
+    d = renewed(d)
+    p = step(p, -OFFSET if inside else OFFSET, n)
+    write(w.e, p)
+    w.facet = facet
+    return p, d, length, INSIDE if inside else 0, False
+
+
+@njit(**KERNEL)
+def rim_of(p, d):
+    """Return the distance along d from p to the unit sphere, from within."""
+    along = dot(p, d)
+    return math.sqrt(max(0.0, along * along + 1.0 - dot(p, p))) - along
+
+
+# --------------------------------------------------------------------------------------------- from specs
+
+
+@dataclass(eq=False)
+class Packed:
+    """The grains of a scene: arrays for kernels and the exemplars' ray-engine scenes."""
+
+    arrays: Grains
+    engines: list
+    notes: tuple[str, ...]
+
+    def hits(self, e: int, starts: np.ndarray, ways: np.ndarray) -> np.ndarray:
+        """Return (n,) int32 the facet each ray meets first on exemplar e, -1 for none."""
+        prims = self.engines[e].run(starts, ways)
+        return np.where(prims >= 0, prims + np.int32(self.arrays.first_facet[e]), np.int32(-1))
+
+
+def nothing_packed(media: int, components: int) -> Packed:
+    """Return grains for the levels that have none."""
+    cells = Cells(1.0, 1, 0.0, np.zeros((0, 3)), np.zeros(2, np.int32), np.zeros(0, np.int32))
+    arrays = Grains(
+        cells=(cells,),  # one, whatever the number of media, which would be part of the type
+        centres=(np.zeros((0, 3)),),
+        radius=np.ones(media),
+        seed=np.zeros(media, np.uint64),
+        share=np.ones(components),
+        eta=np.ones(components),
+        kept_apart=np.zeros(components, np.bool_),
+        exemplar=np.full(components, EXACT_SPHERE, np.int32),
+        planes=np.zeros((0, 4)),
+        centroids=np.zeros((0, 3)),
+        first_facet=np.zeros(0, np.int64),
+    )
+    return Packed(arrays, [], ())
+
+
+def exemplar(spec: GrainSpec, table: Table, where: str) -> Grain:
+    """Return the grain that a table was made of, found by name or in the mesh file that the scene names."""
+    header = table.header["grain"]
+    if spec.mesh is not None:
+        vertices, faces = read_mesh(spec.mesh)
+        grain = grain_from_mesh(vertices, faces, name=spec.mesh.name)
+    elif header["kind"] == "sphere":
+        grain = load_grain("sphere")
+    else:
+        try:
+            grain = load_grain(header["name"], **dict(header["parameters"]))
+        except TSDFError:
+            raise SceneError(
+                f'{where}: the table\'s grain {header["name"]!r} is not built in: name its file as mesh = "..."'
+            ) from None
+    if grain.mesh_hash != header["mesh_sha256"]:
+        raise SceneError(f"{where}: {grain.name} is not the grain the table was made of; build the table again")
+    return grain
+
+
+def packed(scene: Scene, tables: Sequence[Table]) -> Packed:
+    """Pack the media of a scene with the grains of its tables, one table for each component of each medium in turn.
+
+    Raises
+    ------
+    SceneError
+        A grain that cannot be found, a packing fraction beyond what random packings reach.
+    """
+    cells, centres, notes = [], [], []
+    share, eta, kept_apart, chosen = [], [], [], []
+    engines: list[Any] = []
+    known: dict[str, int] = {}
+    planes, centroids, first_facet = [np.zeros((0, 4))], [np.zeros((0, 3))], []
+    facets, at = 0, 0
+    for m, medium in enumerate(scene.media, 1):
+        where = f"{scene.name}: {called('medium', m, medium.name)}"
+        try:
+            packing = pack(medium.packing_fraction, medium.packing_spheres, medium.packing_seed)
+        except TSDFError as error:
+            raise SceneError(f"{where}: {error}") from None
+        cells.append(cells_of(packing))
+        centres.append(np.ascontiguousarray(packing.centres))
+        notes.append(f"{where}: {len(packing.centres)} spheres in a tile of {packing.side:.4g} R, "
+                     f"packing fraction {packing.fraction:.6f}")  # fmt: skip
+        fractions = np.array([grain.fraction for grain in medium.grains])
+        share += list(np.cumsum(fractions) / fractions.sum())
+        for spec in medium.grains:
+            table = tables[at]
+            at += 1
+            grain = exemplar(spec, table, where)
+            eta.append(table.header["optics"]["eta"])
+            kept_apart.append(table.header["optics"]["fresnel"] == "sp")
+            if grain.kind == "sphere":
+                chosen.append(EXACT_SPHERE)
+                continue
+            if grain.mesh_hash not in known:
+                known[grain.mesh_hash] = len(engines)
+                corners = grain.vertices[grain.faces]
+                planes.append(planes_of(corners))
+                centroids.append(corners.mean(axis=1))
+                first_facet.append(facets)
+                facets += len(corners)
+                engines.append(embree_scene(grain))
+            chosen.append(known[grain.mesh_hash])
+    arrays = Grains(
+        cells=tuple(cells),
+        centres=tuple(centres),
+        radius=np.array([medium.radius for medium in scene.media]),
+        seed=np.array([medium.packing_seed for medium in scene.media], np.uint64),
+        share=np.array(share),
+        eta=np.array(eta, np.float64),
+        kept_apart=np.array(kept_apart, np.bool_),
+        exemplar=np.array(chosen, np.int32),
+        planes=np.concatenate(planes),
+        centroids=np.concatenate(centroids),
+        first_facet=np.array(first_facet, np.int64),
+    )
+    return Packed(arrays, engines, tuple(notes))

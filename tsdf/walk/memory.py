@@ -1,0 +1,417 @@
+"""Teleportation that remembers its packing: a chain from bounding sphere to bounding sphere.
+
+Where light left one sphere decides where it enters the next. `neighbours` has the law of that, for one packing fraction
+and any grain; a table's records by entry have what the grain does then. Between the two, the only state is the side of
+the sphere on which light left it and the impact parameter. The packing goes on for ever and only some of its spheres
+hold grains: one that has no room (`room`), or whose grain is missed, is passed straight through, so a flight into a
+medium begins in the packing outside it and needs no law of its own. docs/memory.md derives all this.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from tsdf.compiled import njit
+from tsdf.data.sampler import column_of, density, turned
+from tsdf.data.table import Table
+from tsdf.sampling import GOLDEN, mix, unit
+from tsdf.spheres.neighbours import Law
+from tsdf.vectors import KERNEL, cross, dot, frame, step, triple
+from tsdf.walk.geometry import clearance
+from tsdf.walk.lights import draw as draw_light
+from tsdf.walk.room import MESH, stands
+from tsdf.walk.walker import (
+    DIM,
+    ENDED,
+    EVENTS,
+    LOOK,
+    OTHER,
+    PATIENCE,
+    TRUNCATED,
+    WAIT,
+    born,
+    cast,
+    full,
+    halves,
+    lives,
+    write,
+)
+
+AIMED = 16  # records of each column of cos theta that light aimed at a lamp is drawn from
+
+
+class Memory(NamedTuple):
+    """What kernels ask about packings of media (m,) and grains of components (c,); lengths in R.
+
+    law (m, cells, k, 4) float32: gap, impact parameter, cosine and sine of the azimuth of the next entry, cells being
+    equal parts of the squared impact parameter of the exit; records (m,): how many of k; gaps (m, cells k + 1): running
+    sum of the gaps, from 0 to 1; fraction (m,): packing fraction; radius (m,): R [unit].
+
+    choice (c,): running sum of the number fractions in each medium; hit (c, columns) float32, columns (c,): hit
+    probability by equal parts of the squared impact parameter of the entry; grains (c, columns, k, 8) float32, kept
+    (c,): records of the light that met it, in the frame (side of the entry, d x side, d): direction, side of the exit,
+    impact parameter of the exit, path length.
+
+    For light that is aimed: aimed (all columns of cos theta, AIMED) int32: numbers column k + record; entered (c,
+    columns, k) float32: impact parameter of their entry; met (c,): hit probability.
+    """
+
+    law: np.ndarray
+    records: np.ndarray
+    gaps: np.ndarray
+    fraction: np.ndarray
+    radius: np.ndarray
+    choice: np.ndarray
+    hit: np.ndarray
+    columns: np.ndarray
+    grains: np.ndarray
+    kept: np.ndarray
+    aimed: np.ndarray
+    entered: np.ndarray
+    met: np.ndarray
+
+
+# ------------------------------------------------------------------------------------------- for kernels
+
+
+@njit(forceinline=True, **KERNEL)
+def onward(memory, m, d, t, b, bits):
+    """Draw the next sphere that light along d enters, given the side t and the impact parameter b with which it left
+    one; return the gap [R], the side on which it is entered, and the impact parameter."""
+    cells = memory.law.shape[1]
+    cell = min(int(b * b * cells), cells - 1)
+    k = int(unit(bits) * memory.records[m])
+    record = memory.law[m, cell, k]
+    c, s = float(record[2]), float(record[3])
+    if bits & np.uint64(1):  # a bit that `unit` does not use: the mirror image is as likely
+        s = -s
+    up = cross(d, t)
+    side = (c * t[0] + s * up[0], c * t[1] + s * up[1], c * t[2] + s * up[2])
+    return float(record[0]), side, float(record[1])
+
+
+@njit(forceinline=True, **KERNEL)
+def upright(t, d):
+    """Return a nearly unit vector t, nearly perpendicular to the unit vector d, made so: errors do not pile up."""
+    t = step(t, -dot(t, d), d)
+    half = 1.5 - 0.5 * dot(t, t)
+    return t[0] * half, t[1] * half, t[2] * half
+
+
+@njit(**KERNEL)
+def begin(w, memory):
+    """Draw the sphere that a walker enters next, of which nothing is known: it starts anywhere in the packing."""
+    m, d = w.medium, triple(w.d)
+    w.key += GOLDEN
+    u0, u1 = halves(mix(w.key))
+    w.key += GOLDEN
+    u2, u3 = halves(mix(w.key))
+    a, c = frame(d)
+    co, si = turned(u1)
+    t = step(step((0.0, 0.0, 0.0), co, a), si, c)
+    if u0 < memory.fraction[m]:  # in a sphere, the oftener the longer its chord
+        b2 = 1.0 - u2 ** (2.0 / 3.0)
+        w.key += GOLDEN
+        gap, t, b = onward(memory, m, d, t, math.sqrt(b2), mix(w.key))
+        w.free = memory.radius[m] * (2.0 * u3 * math.sqrt(1.0 - b2) + gap)
+    else:  # in a gap, the oftener the longer it is
+        sums = memory.gaps[m]
+        low, high = 0, sums.shape[0] - 1
+        while high - low > 1:
+            middle = (low + high) // 2
+            if sums[middle] <= u2:
+                low = middle
+            else:
+                high = middle
+        cell, k = low // memory.law.shape[2], low % memory.law.shape[2]
+        b = float(memory.law[m, cell, k, 1])
+        w.free = memory.radius[m] * u3 * float(memory.law[m, cell, k, 0])
+    write(w.t, t)
+    w.b = b
+
+
+@njit(**KERNEL)
+def connect(world, batch, w, amounts, p, c, share, bound):
+    """Send off light that arrives from a light and is deflected into the walker's path by a grain.
+
+    A bounding sphere with a grain of component c of its medium is entered at p by the walker, whose key is for this;
+    whichever sphere it is, for the side on which it is entered is drawn anew. `share` is the probability that this is
+    done at all; nothing is nearer than `bound`.
+    """
+    media, memory, tables, room = world.media, world.memory, world.tables, world.room
+    m, d = w.medium, triple(w.d)
+    key = mix(w.key ^ OTHER)
+    u0, u1 = halves(key)
+    key += GOLDEN
+    u2, u3 = halves(mix(key))
+    toward, light_pdf, light = draw_light(world.lights, u0, u1, u2)
+    if not light_pdf > 0.0:
+        return
+    cosine = min(max(dot(d, toward), -1.0), 1.0)
+    column = column_of(tables, c, cosine)
+    phase = memory.met[c] * density(tables, column)
+    if not phase > 0.0:
+        return
+    number = memory.aimed[column, int(u3 * AIMED)]
+    i, k = number // memory.grains.shape[2], number % memory.grains.shape[2]
+    b, grain = float(memory.entered[c, i, k]), memory.grains[c, i, k]
+    # The side of the entry is the one from which the record's light goes toward the lamp
+    side = step(toward, -cosine, d)
+    size = math.sqrt(dot(side, side))
+    if size > 1e-12:
+        side = (side[0] / size, side[1] / size, side[2] / size)
+    else:
+        side = frame(d)[0]
+    x, y = float(grain[0]), float(grain[1])
+    size = math.sqrt(x * x + y * y)
+    x, y = (x / size, y / size) if size > 1e-12 else (1.0, 0.0)
+    t = upright(step(step((0.0, 0.0, 0.0), x, side), -y, cross(d, side)), d)
+    radius = memory.radius[m]
+    along = math.sqrt(max(0.0, 1.0 - b * b))
+    centre = step(step(p, radius * along, d), -radius * b, t)
+    if (bound <= 2.0 * radius or (room.kind[m] == MESH and not room.whole[m])) and not stands(room, m, centre):
+        return
+    up = cross(d, t)
+    b_out = float(grain[6])
+    along = math.sqrt(max(0.0, 1.0 - b_out * b_out))
+    nx, ny = b_out * grain[3] + along * grain[0], b_out * grain[4] + along * grain[1]
+    nz = b_out * grain[5] + along * grain[2]
+    n = step(step(step((0.0, 0.0, 0.0), nx, t), ny, up), nz, d)
+    number = born(batch, amounts)
+    shadow, its_amounts = batch.out[number], batch.out_amounts[number]
+    if media.slot[c] >= 0:
+        its_amounts[media.slot[c]] += media.scale[c] * float(grain[7])
+    cast(w, shadow, step(centre, radius, n), toward, light, phase / (light_pdf + phase) / share, m, key)
+    away = step(n, -dot(n, toward), toward)
+    b = math.sqrt(dot(away, away))
+    t = (away[0] / b, away[1] / b, away[2] / b) if b > 1e-9 else frame(toward)[0]
+    shadow.key += GOLDEN
+    gap, t, shadow.b = onward(memory, m, toward, t, min(b, 1.0), mix(shadow.key))
+    write(shadow.t, t)
+    shadow.free = radius * gap
+
+
+@njit(**KERNEL)
+def roam(world, batch, w, amounts, once):
+    """Take a walker in a known medium from sphere to sphere while its flights can meet nothing else; as
+    `transport.wander`, but that a shadow ends at the first grain it meets. Returns LOOK, WAIT or ENDED."""
+    g, room, media, memory, tables = world.geometry, world.room, world.media, world.memory, world.tables
+    m = w.medium
+    p, d, t, b, key, free = triple(w.p), triple(w.d), triple(w.t), w.b, w.key, w.free
+    radius, sampled = memory.radius[m], world.lights.sampled and not w.shadow
+    first, last = media.first[m], media.first[m] + media.kinds[m] - 1
+    mean, sure = media.free[m], room.whole[m] or room.kind[m] != MESH
+    luck, pdf, steps, met, state = w.luck, w.pdf, 0, 0, LOOK
+    bound, fresh = clearance(g, m, p), True
+    if free < 0.0:
+        begin(w, memory)
+        t, b, key, free = triple(w.t), w.b, w.key, w.free
+    while True:
+        if not once and bound <= free:
+            if not fresh:
+                bound = clearance(g, m, p)
+            if bound <= free:
+                break
+        if steps >= PATIENCE or (sampled and not once and full(batch)):
+            state = WAIT
+            break
+        fresh = False
+        steps += 1
+        p = step(p, free, d)
+        bound -= free
+        c = first
+        if last > first:
+            key += GOLDEN
+            u = unit(mix(key))
+            while c < last and u >= memory.choice[c]:
+                c += 1
+        if sampled:
+            if bound < 8.0 * mean:
+                bound = max(bound, clearance(g, m, p))
+            # The root of how likely the shadow is to arrive: it ends at a grain or not at all, and so costs least
+            share = min(1.0, math.exp(0.5 * (2.0 * radius - bound) / mean))
+            key += GOLDEN
+            if unit(mix(key)) < share:
+                write(w.d, d)
+                w.key = key
+                connect(world, batch, w, amounts, p, c, share, bound)
+
+        # Is there a grain in this sphere, and is it met?
+        along = math.sqrt(max(0.0, 1.0 - b * b))
+        centre = step(step(p, radius * along, d), -radius * b, t)
+        column = min(int(b * b * memory.columns[c]), memory.columns[c] - 1)
+        there = True
+        if bound <= 2.0 * radius or not sure:
+            if sure:
+                bound = max(bound, clearance(g, m, p))
+            if bound <= 2.0 * radius or not sure:
+                there = stands(room, m, centre)
+        hit = memory.hit[c, column]
+        if there and hit < 1.0:
+            key += GOLDEN
+            there = unit(mix(key)) < hit
+        key += GOLDEN
+        bits = mix(key)
+        through = 0.0
+        if not there:
+            through = 2.0 * along
+        elif w.shadow:
+            state = ENDED
+            break
+        else:
+            met += 1
+            u = unit(bits)
+            grain = memory.grains[c, column, int(u * memory.kept[c])]
+            up = cross(d, t)
+            x, y, z = float(grain[0]), float(grain[1]), float(grain[2])
+            if sampled:
+                pdf = memory.met[c] * density(tables, column_of(tables, c, z))
+                if not pdf > 0.0 or (x == 0.0 and y == 0.0):
+                    pdf = -1.0
+            new = step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d)
+            half = 1.5 - 0.5 * dot(new, new)
+            new = (new[0] * half, new[1] * half, new[2] * half)
+            x, y, z = float(grain[3]), float(grain[4]), float(grain[5])
+            t = upright(step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d), new)
+            d, b = new, float(grain[6])
+            n = step(step((0.0, 0.0, 0.0), b, t), math.sqrt(max(0.0, 1.0 - b * b)), d)
+            p = step(centre, radius, n)
+            bound -= 2.0 * radius
+            slot = media.slot[c]
+            if slot >= 0:
+                length = media.scale[c] * float(grain[7])
+                amounts[slot] += length
+                luck += world.absorption.least[slot] * length
+            key += GOLDEN
+            bits = mix(key)
+        gap, t, b = onward(memory, m, d, t, b, bits)
+        free = radius * (through + gap)
+        if luck < DIM:
+            w.luck = luck
+            key += GOLDEN
+            if not lives(w, key):
+                state = ENDED
+                break
+            luck = w.luck
+        if w.events + met >= media.limit:
+            batch.counters[TRUNCATED] += 1
+            state = ENDED
+            break
+        if once:
+            break
+    batch.counters[EVENTS] += met
+    w.events += met
+    write(w.p, p)
+    write(w.d, d)
+    write(w.t, t)
+    w.b, w.key, w.free, w.luck, w.pdf = b, key, free, luck, pdf
+    return state
+
+
+# ------------------------------------------------------------------------------------------- from tables
+
+
+def remembered(table: Table) -> tuple[np.ndarray, np.ndarray]:
+    """Return a table's records by entry as kernels take them, (columns, k, 8) float32, and the impact parameters of
+    their entries (columns, k): see `Memory`.
+
+    The exit normal is the entry's and the offset together, at unit length, so that no rounding puts it off the sphere.
+    """
+    record = {name: values.T.astype(np.float64) for name, values in table.memory.items()}
+    b = np.sqrt(np.clip(record["entry_b2"], 0.0, 1.0))
+    cos_theta = np.clip(record["cos_theta"], -1.0, 1.0)
+    sin_theta, a = np.sqrt(1.0 - cos_theta**2), record["entry_azimuth"]
+    d = np.stack((sin_theta * np.cos(a), sin_theta * np.sin(a), cos_theta), axis=-1)
+    straight = (np.abs(cos_theta) == 1.0)[..., None]
+    d = np.where(straight, (0.0, 0.0, 1.0) * np.sign(d[..., 2:]), d)
+    phi = a + record["phi_delta"]
+    n = np.stack((b + record["r"] * np.cos(phi), record["r"] * np.sin(phi), record["z"] - np.sqrt(1.0 - b**2)), axis=-1)
+    n /= np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-300)
+    side = n - (n * d).sum(axis=-1, keepdims=True) * d
+    out = np.linalg.norm(side, axis=-1, keepdims=True)
+    other = np.cross(d, np.where(np.abs(d[..., :1]) < 0.5, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    side = np.where(out > 1e-9, side / np.maximum(out, 1e-300), other / np.linalg.norm(other, axis=-1, keepdims=True))
+    return np.concatenate((d, side, np.minimum(out, 1.0), record["l"][..., None]), axis=-1).astype(np.float32), b
+
+
+def _aimed(table: Table, most: int) -> np.ndarray:
+    """Return for each column of cos theta AIMED records of light deflected so, (columns, AIMED) int32, as numbers
+    column * most + record; the nearest where a column has none."""
+    cos_theta = table.memory["cos_theta"].T.astype(np.float64)
+    columns, k = cos_theta.shape
+    weight = np.repeat(table.hit, k) * (np.abs(cos_theta.ravel()) < 1.0)
+    number = (np.arange(columns)[:, None] * most + np.arange(k)).ravel()
+    order = np.argsort(cos_theta.ravel(), kind="stable")
+    order = order[weight[order] > 0.0]
+    result = np.zeros((columns, AIMED), np.int32)
+    if not len(order):
+        return result
+    values, running = cos_theta.ravel()[order], np.concatenate(([0.0], np.cumsum(weight[order])))
+    edges = table.cos_theta_edges
+    ends = np.searchsorted(values, edges[1:])
+    ends[-1] = len(values)
+    starts = np.searchsorted(values, edges[:-1])
+    for column, (first, last) in enumerate(zip(starts, ends, strict=True)):
+        if last <= first:
+            first = min(max(first - AIMED // 2, 0), max(len(values) - AIMED, 0))
+            last = min(first + AIMED, len(values))
+        places = running[first] + (np.arange(AIMED) + 0.5) / AIMED * (running[last] - running[first])
+        chosen = np.clip(np.searchsorted(running, places, side="right") - 1, first, last - 1)
+        result[column] = number[order[chosen]]
+    return result
+
+
+def memory_of(
+    laws: Sequence[Law],
+    fractions: Sequence[float],
+    radii: Sequence[float],
+    grains: Sequence[Sequence[tuple[Table, float]]],
+) -> Memory:
+    """Return what kernels ask about media.
+
+    Parameters
+    ----------
+    laws : sequence of Law
+        Of each medium's packing, all with as many cells.
+    fractions, radii : sequences of float
+        Packing fraction [1] and R [unit] of each medium.
+    grains : sequence of sequences of (Table, float)
+        Tables with records by entry, and number fractions, of each medium's components.
+    """
+    media, tables = len(laws), [table for some in grains for table, _ in some]
+    most = max((law.gap.shape[1] for law in laws), default=1)
+    cells = laws[0].gap.shape[0] if laws else 1
+    law = np.zeros((media, cells, most, 4), np.float32)
+    gaps = np.zeros((media, cells * most + 1))
+    for m, one in enumerate(laws):
+        k = one.gap.shape[1]
+        law[m, :, :k] = np.stack((one.gap, np.sqrt(one.entry_b2), np.cos(one.azimuth), np.sin(one.azimuth)), axis=-1)
+        gaps[m, 1:] = np.cumsum(law[m, :, :, 0].astype(np.float64))
+        gaps[m] /= gaps[m, -1]
+    columns = [len(table.hit) for table in tables]
+    kept = [len(table.memory["l"]) for table in tables]
+    shape = (len(tables), max(columns, default=1), max(kept, default=1))
+    hit, records = np.zeros(shape[:2], np.float32), np.zeros((*shape, 8), np.float32)
+    entered, aimed = np.zeros(shape, np.float32), [np.zeros((0, AIMED), np.int32)]
+    for c, (table, n, k) in enumerate(zip(tables, columns, kept, strict=True)):
+        hit[c, :n] = table.hit
+        records[c, :n, :k], entered[c, :n, :k] = remembered(table)
+        aimed.append(_aimed(table, shape[2]))
+    shares = [np.array([share for _, share in some]) for some in grains]
+    return Memory(
+        law=law,
+        records=np.array([one.gap.shape[1] for one in laws], np.int64),
+        gaps=gaps,
+        fraction=np.array(fractions, np.float64),
+        radius=np.array(radii, np.float64),
+        choice=np.concatenate([np.zeros(0), *(np.cumsum(share) / share.sum() for share in shares)]),
+        hit=hit,
+        columns=np.array(columns, np.int64),
+        grains=records,
+        kept=np.array(kept, np.int64),
+        aimed=np.concatenate(aimed),
+        entered=entered,
+        met=np.array([table.statistics["hit_probability"] for table in tables], np.float64),
+    )

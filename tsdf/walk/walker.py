@@ -1,0 +1,202 @@
+"""A walker, one sample of one pixel on its way, and what all that moves it shares.
+
+`transport` says where walkers go, `memory` how they go on through grains whose packing they remember.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from tsdf.compiled import njit
+from tsdf.sampling import mix, unit
+from tsdf.scene.levels import Traits
+from tsdf.vectors import KERNEL
+from tsdf.walk.geometry import NONE
+
+WALKER = np.dtype(
+    [("p", "3f8"), ("d", "3f8"), ("q", "3f8"), ("e", "3f8"), ("t", "3f8"), ("colour", "3f8"), ("weight", "f8"),
+     ("luck", "f8"), ("pdf", "f8"), ("free", "f8"), ("length", "f8"), ("gained", "f8"), ("skip", "f8"), ("b", "f8"),
+     ("key", "u8"), ("grain", "u8"),
+     ("events", "i8"), ("sample", "i4"), ("ray", "i4"), ("medium", "i4"), ("mode", "i4"), ("component", "i4"),
+     ("facet", "i4"), ("state", "i4"), ("tries", "i4"), ("shadow", "i4")]
+)  # fmt: skip
+# p, d: place and direction. q, e, length, gained: of a jump, the direction after it, its own, its length and what it
+# adds to the amounts; in a grain, q is its centre, e where the ray starts. luck: logarithm of a bound of the
+# throughput. pdf: density per steradian with which d was drawn, -1 for none. free: the free path still to fly, < 0 if
+# not drawn. skip: how far beyond p the ray engine starts. ray: row of the ray engine's answers, -1 for none. t, b: of
+# the bounding sphere at the end of the free path, the side on which it is entered and the impact parameter [R].
+FLY, JUMP, GRAIN = 0, 1, 2
+UNKNOWN = -2  # medium of a walker that may have crossed a boundary
+
+EVENTS, RAYS, TRUNCATED, FAULTS = range(4)  # counters
+LIVE, MOST, ASKED, GRAINS_ASKED = range(4)  # of `Batch.asked`
+CLEAR, LOOK, WAIT, ENDED = range(4)  # what becomes of a walker: it has met nothing yet, must look where it goes, ...
+
+OTHER = np.uint64(0xA5A5A5A5A5A5A5A5)
+LOW = np.uint64(0xFFFFFFFF)
+HALF_WORD = 1.0 / 4294967296.0
+PATIENCE = 100_000  # steps of a walker before others have their turn
+MAX_EVENTS = 50_000_000  # of one path; only light that nothing lets out comes that far, and it is counted
+DIM = math.log(0.25)  # walkers dimmer than this may end
+FAINT = 0.02  # shadows fainter than this may end
+TRIES = 8  # to start a ray off a facet, each twice as far from it
+
+
+class Media(NamedTuple):
+    """What kernels ask about media (m,) and their components (c,).
+
+    traits: of the level, for all media; free: mean free path; reach: the longest jump; first, kinds: its
+    first component and how many it has; travel: amount that counts the length flown, or -1. Of components: choice, the
+    running sum of the probability that the next grain met is of it; scale: what one event's path length [R], or the
+    event itself where there is none, counts in the amount `slot`; slot, -1 for none; g: mean cosine of the
+    Henyey-Greenstein lobe. Lengths in scene units. limit: events after which a path is given up.
+    """
+
+    traits: Traits
+    free: np.ndarray
+    reach: np.ndarray
+    first: np.ndarray
+    kinds: np.ndarray
+    travel: np.ndarray
+    choice: np.ndarray
+    scale: np.ndarray
+    slot: np.ndarray
+    g: np.ndarray
+    limit: int
+
+
+class Absorption(NamedTuple):
+    """How amounts (a,) of matter become colour: exponents per wavelength (k, a) and per channel (3, a), the weight
+    (k, 3) of each wavelength in linear RGB, and the exponent of the least absorbed light (a,)."""
+
+    spectral: np.ndarray
+    rgb: np.ndarray
+    weight: np.ndarray
+    least: np.ndarray
+
+
+class Batch(NamedTuple):
+    """The walkers that one thread takes on together, and what they ask the ray engine.
+
+    walkers (n,) and amounts (n, a) are those under way, out and out_amounts receive those that go on and the shadows
+    that are born; starts and ways (n, 3) float32 the rays in the scene, grain_starts and grain_ways (e, n, 3) those in
+    the exemplars, hits (n + 1, engines) and grain_hits (e, n) int32 the facets that they meet, the last of
+    hits those of the walker under way. radiance (samples, 3);
+    counters (4,): see EVENTS; asked (3 + e,): walkers in out, the number of them from which on no more are made, rays
+    asked for in the scene, and in each exemplar.
+    """
+
+    walkers: np.ndarray
+    amounts: np.ndarray
+    out: np.ndarray
+    out_amounts: np.ndarray
+    hits: np.ndarray
+    grain_hits: np.ndarray
+    starts: np.ndarray
+    ways: np.ndarray
+    grain_starts: np.ndarray
+    grain_ways: np.ndarray
+    radiance: np.ndarray
+    counters: np.ndarray
+    asked: np.ndarray
+
+
+@njit(**KERNEL)
+def full(batch):
+    """Return whether a batch has no room for more walkers."""
+    return batch.asked[LIVE] >= batch.asked[MOST]
+
+
+@njit(**KERNEL)
+def born(batch, amounts):
+    """Return the number in `out` of a new walker, whose amounts are those given."""
+    live = batch.asked[LIVE]
+    batch.asked[LIVE] += 1
+    copy(batch.out_amounts[live], amounts)
+    return live
+
+
+@njit(**KERNEL)
+def absorbed(absorption, amounts):
+    """Return the colour that the amounts of matter crossed leave of white light."""
+    crossed = False
+    for i in range(amounts.shape[0]):
+        crossed |= amounts[i] != 0.0
+    if not crossed:
+        return 1.0, 1.0, 1.0
+    r, g, b = 0.0, 0.0, 0.0
+    if absorption.spectral.shape[0] == 0:
+        r, g, b = 1.0, 1.0, 1.0
+    for k in range(absorption.spectral.shape[0]):
+        exponent = 0.0
+        for i in range(amounts.shape[0]):
+            exponent += absorption.spectral[k, i] * amounts[i]
+        passed = math.exp(exponent)
+        r += absorption.weight[k, 0] * passed
+        g += absorption.weight[k, 1] * passed
+        b += absorption.weight[k, 2] * passed
+    er, eg, eb = 0.0, 0.0, 0.0
+    for i in range(amounts.shape[0]):
+        er += absorption.rgb[0, i] * amounts[i]
+        eg += absorption.rgb[1, i] * amounts[i]
+        eb += absorption.rgb[2, i] * amounts[i]
+    if er == eg and er == eb:
+        grey = math.exp(er)
+        return r * grey, g * grey, b * grey
+    return r * math.exp(er), g * math.exp(eg), b * math.exp(eb)
+
+
+@njit(**KERNEL)
+def find(world, batch, w, amounts, light):
+    """Add light found by a walker to its sample."""
+    left = absorbed(world.absorption, amounts)
+    for k in range(3):
+        batch.radiance[w.sample, k] += w.weight * w.colour[k] * light[k] * left[k]
+
+
+@njit(forceinline=True, **KERNEL)
+def halves(bits):
+    """Return two numbers in [0, 1) from 64 bits."""
+    return float(bits >> np.uint64(32)) * HALF_WORD, float(bits & LOW) * HALF_WORD
+
+
+@njit(**KERNEL)
+def copy(row, other):
+    """Write a row to another."""
+    for i in range(row.shape[0]):
+        row[i] = other[i]
+
+
+@njit(**KERNEL)
+def write(row, v):
+    """Write a triple to a row."""
+    row[0], row[1], row[2] = v
+
+
+@njit(**KERNEL)
+def cast(w, shadow, p, toward, light, weight, m, key):
+    """Write the shadow of walker w: from p toward a light of that colour."""
+    write(shadow.p, p)
+    write(shadow.d, toward)
+    for k in range(3):
+        shadow.colour[k] = w.colour[k] * w.weight * light[k] * weight
+    shadow.weight, shadow.luck, shadow.pdf, shadow.free = 1.0, 0.0, -1.0, -1.0
+    shadow.skip, shadow.key, shadow.events = 0.0, key, 0
+    shadow.sample, shadow.ray, shadow.medium, shadow.mode = w.sample, NONE, m, FLY
+    shadow.tries, shadow.shadow = 0, 1
+
+
+@njit(**KERNEL)
+def lives(w, key):
+    """Play roulette with a walker that has become dim: it ends, or goes on with what those that end had.
+
+    The chance to live is the throughput itself, without a cap, so light that loses nothing is never in play.
+    """
+    chance = 2.0 * math.exp(w.luck)
+    if unit(mix(key ^ OTHER)) >= chance:
+        w.weight = 0.0
+        return False
+    w.weight /= chance
+    w.luck = math.log(0.5)
+    return True
