@@ -1,6 +1,6 @@
 """Sizes and densities in everybody's words: what a bounding radius and a packing fraction are to others, and back.
 
-`convert` is the one way from words to numbers, whoever asks: scenes, commands, loaders. docs/sizes.md defines the words.
+`convert` is the one way from words to numbers, whoever asks: scenes, commands, loaders. docs/sizes.md defines words.
 Lengths in here are in units of the bounding radius R or in scene units, densities in kg/m^3. Of a mixture the grains
 have one R; volumes, surfaces and projected areas are means over the number of grains, dimensions those of the largest.
 """
