@@ -2,7 +2,7 @@
 //
 // The reader follows schema/SPEC.md and checks every rule of it; the inflate, SHA-256 and JSON it needs are in here.
 // Sampling is Algorithm 1 of Meng et al. 2015 (doi 10.1145/2766949) by exact inversion of cumulative masses with guide
-// tables (Chen & Asau 1974): the same random numbers give the same events as tsdf.sampler in Python. Nothing here throws
+// tables (Chen & Asau 1974): the same random numbers give the same events as tsdf.data.sampler in Python. Nothing here throws
 // of itself, nothing allocates once `Sampler::prepare` is done, and a const Sampler serves any number of threads.
 // Lengths are in units of R, the radius of the bounding sphere, angles in radians. Buffers and a shader: docs/cpp.md.
 // Licence: MIT.
