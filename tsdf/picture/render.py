@@ -84,7 +84,7 @@ class Walkers:
         Walkers under way, and what they were.
     radiance : (n, 3) float64
         Found so far by each sample; `reserve` makes room.
-    counters : (4,) int64
+    counters : (6,) int64
         See `walker.EVENTS`.
     """
 
@@ -92,7 +92,7 @@ class Walkers:
         self.arrays = Handle(
             T.WorldArrays(
                 world.place.arrays, world.place.room, world.media, world.tables, world.lights, world.packed.arrays,
-                world.memory, world.absorption,
+                world.memory, world.leaps, world.absorption,
             )
         )  # fmt: skip
         self.place, self.packed = world.place, world.packed
@@ -103,7 +103,7 @@ class Walkers:
         self.grain_hits = np.full((exemplars, ROOM), -1, np.int32)
         self.starts, self.ways = (np.zeros((ROOM, 3), np.float32) for _ in range(2))
         self.grain_starts, self.grain_ways = (np.zeros((exemplars, ROOM, 3), np.float32) for _ in range(2))
-        self.counters = np.zeros(4, np.int64)
+        self.counters = np.zeros(6, np.int64)
         self.asked = np.zeros(W.GRAINS_ASKED + exemplars, np.int64)
         self.radiance = np.zeros((0, 3))
         self.reserve(1)

@@ -264,7 +264,7 @@ def bulk_experiment(
     level: str, grain: GrainSpec, fraction: float, packing: int = 0, block: int = BLOCK, blocks: int = BLOCKS
 ) -> Experiment:
     """Return what `diffusion` measures."""
-    world = build(scene_of(Sphere((0.0, 0.0, 0.0), FAR), grain, fraction, packing), level, limit=block)
+    world = build(scene_of(Sphere((0.0, 0.0, 0.0), FAR), grain, fraction, packing), level, limit=block, leap=0.0)
 
     def read(places: np.ndarray, ends: Ends) -> np.ndarray:
         steps = np.diff(places, axis=1)
@@ -309,14 +309,14 @@ def _lower(world: World, fraction: float, packing: int, height: float) -> None:
 
 def slab_experiment(
     level: str, grain: GrainSpec, fraction: float, layer: float, cosine: float = 1.0, packing: int = 0,
-    coefficients: Sequence[float] | None = None, top: float = 0.0,
+    coefficients: Sequence[float] | None = None, top: float = 0.0, leap: float = 0.0,
 ) -> Experiment:  # fmt: skip
     """Return what `slab` measures: reflectance, transmittance and profile one after the other, and so again for each of
     several absorption coefficients [1/R] if they are given, of the very same paths. The layer's
     upper end is at height `top` of the tile."""
     if coefficients is not None:
         grain = replace(grain, absorption=Absorption("grey", (FAINTEST,)))
-    world = build(scene_of(Slab(-layer, 0.0), grain, fraction, packing), level)
+    world = build(scene_of(Slab(-layer, 0.0), grain, fraction, packing), level, leap=leap)
     if level == "explicit":
         _lower(world, fraction, packing, top)
     way = np.array([math.sqrt(1.0 - cosine**2), 0.0, -cosine])
