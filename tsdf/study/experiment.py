@@ -49,8 +49,8 @@ class Ends(NamedTuple):
         What roulette makes of it; throughput but for absorption, 0 if it did not come out.
     amounts : (n, a) float64
         Of matter crossed, see `walker.Absorption`.
-    events : int
-        Grains met, by all.
+    events, drawn : int
+        Grains met, by all; and what was drawn for that, single events and leaps.
     seconds : float
         Processor time spent on it, by all threads together.
     """
@@ -61,6 +61,7 @@ class Ends(NamedTuple):
     weight: np.ndarray
     amounts: np.ndarray
     events: int
+    drawn: int
     seconds: float
 
 
@@ -126,7 +127,8 @@ def _batch(world: World, camera: T.Camera, first: int, paths: int, seed: int, ma
             mine.amounts[0][live : live + more] = mine.amounts[1][gone][again]
             live += more
     events, seconds = int(mine.counters[W.EVENTS]), time.thread_time() - began
-    return places, Ends(start, place, way, weight, amounts, events, seconds)
+    drawn = events - int(mine.counters[W.LEAPT]) + int(mine.counters[W.LEAPS])
+    return places, Ends(start, place, way, weight, amounts, events, drawn, seconds)
 
 
 def follow(
@@ -161,8 +163,10 @@ def follow(
         pool.shutdown(cancel_futures=True)
     ends = [one for _, one in found]
     start, place, way, weight, amounts = (np.concatenate([one[k] for one in ends]) for k in range(5))
-    events, taken = sum(one.events for one in ends), sum(one.seconds for one in ends)
-    return np.concatenate([places for places, _ in found]), Ends(start, place, way, weight, amounts, events, taken)
+    events, drawn, taken = (sum(one[k] for one in ends) for k in range(5, 8))
+    return np.concatenate([places for places, _ in found]), Ends(
+        start, place, way, weight, amounts, events, drawn, taken
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,6 +187,7 @@ class Sums:
     total: np.ndarray | float = 0.0
     squares: np.ndarray | float = 0.0
     events: int = 0
+    drawn: int = 0
     seconds: float = 0.0
     lost: int = 0
 
@@ -192,7 +197,8 @@ class Sums:
         values = values[there]
         self.paths += len(values)
         self.total, self.squares = self.total + values.sum(axis=0), self.squares + (values**2).sum(axis=0)
-        self.events, self.seconds = self.events + ends.events, self.seconds + ends.seconds
+        self.events, self.drawn = self.events + ends.events, self.drawn + ends.drawn
+        self.seconds += ends.seconds
 
     @property
     def mean(self) -> np.ndarray:

@@ -21,28 +21,26 @@ from tsdf.walk.walker import DIM, EVENTS, LEAPS, LEAPT, halves, lives, write
 
 NEVER = 1 << 60
 ENDS, LEAPT_ON = -1, 0  # what `leap` says; else how many events it is too early to ask again
-PATIENT = 0.25  # of the events in which light diffuses as far as room is missing, it is not asked again
+PATIENT = 1.0  # of the events in which light diffuses as far as room is missing, it is not asked again
+
+
+ROOM, MARGIN, PACE, UNIT = range(4)
 
 
 class Leaps(NamedTuple):
     """What kernels ask about leaps in media (m,); lengths in scene units, those of records in `unit` of each medium.
 
-    room: of the smallest ball, infinite where there are no leaps; margin: what is left free around a ball; pace: root
-    of the mean square step; ahead, aside (m, cells), cells: where the middle is from the place of an entry, along the
-    direction and the side of the entry, by cells of the squared impact parameter; square (m, k): radius^2 of the
-    records' balls; law (m, k, 3): A, B and the number of grains over r^2 + 2 A r + B = 1; records (m, k, n, 7),
-    crossed (m, k, n, components + 1) float32: see `passage.Passage`; kept (m,): how many of n.
+    size (m, 4): ROOM, radius of the smallest ball, infinite where there are no leaps; MARGIN, what is left free around
+    a ball; PACE, root of the mean square step; UNIT. middle (m, cells, 2), cells (m,): where a ball's middle is from the
+    place of an entry, along the direction and the side of the entry, by cells of the squared impact parameter. balls
+    (m, k, 4), of the records: squared radius, A, B, and 1 / (r^2 + 2 A r + B). records (m, k, n, 8), crossed (m, k, n,
+    components + 1) float32: see `passage.Passage`; kept (m,): how many of n.
     """
 
-    unit: np.ndarray
-    room: np.ndarray
-    margin: np.ndarray
-    pace: np.ndarray
-    ahead: np.ndarray
-    aside: np.ndarray
+    size: np.ndarray
+    middle: np.ndarray
     cells: np.ndarray
-    square: np.ndarray
-    law: np.ndarray
+    balls: np.ndarray
     records: np.ndarray
     crossed: np.ndarray
     kept: np.ndarray
@@ -53,32 +51,39 @@ def patience(leaps, m, missing):
     """Return how many events it is too early to ask for a leap where so much room is missing."""
     if not missing < math.inf:
         return NEVER
-    times = max(missing, 0.0) / leaps.pace[m]
+    times = max(missing, 0.0) / leaps.size[m, PACE]
     return 1 + int(PATIENT * times * times)
+
+
+@njit(forceinline=True, **KERNEL)
+def missing(leaps, m, bound):
+    """Return how much room is missing for a leap about a place of that clearance."""
+    return leaps.size[m, ROOM] + leaps.size[m, MARGIN] - bound
 
 
 @njit(**KERNEL)
 def leap(world, batch, w, amounts):
     """Take a walker that enters a sphere, or meets a point, out of the largest ball that there is room for.
 
-    Returns LEAPT_ON, ENDS where roulette ends it, or if there is too little room, after how many events to ask again.
+    Returns LEAPT_ON, ENDS where roulette ends it, or if there is too little room, after how many events to ask again;
+    and a length within which the walker then is sure to have nothing around it.
     """
     leaps, m = world.leaps, w.medium
     p, d = triple(w.p), triple(w.d)
-    remembers, cells = world.media.traits.remembers, leaps.cells[m]
-    middle = step(p, leaps.ahead[m, 0], d)
+    remembers, margin, cell = world.media.traits.remembers, leaps.size[m, MARGIN], 0
     if remembers:
-        b = w.b
-        cell = min(int(b * b * cells), cells - 1)
-        middle = step(step(p, leaps.ahead[m, cell], d), leaps.aside[m, cell], triple(w.t))
-    r = clearance(world.geometry, m, middle) - leaps.margin[m]
+        cell = min(int(w.b * w.b * leaps.cells[m]), leaps.cells[m] - 1)
+    middle = step(p, leaps.middle[m, cell, 0], d)
+    if remembers:
+        middle = step(middle, leaps.middle[m, cell, 1], triple(w.t))
+    r = clearance(world.geometry, m, middle) - margin
     away = step(middle, -1.0, p)
     # With p in the ball, both are on the same side of everything
-    if r < leaps.room[m] or dot(away, away) >= r * r:
-        return patience(leaps, m, leaps.room[m] - r)
+    if r < leaps.size[m, ROOM] or dot(away, away) >= r * r:
+        return patience(leaps, m, leaps.size[m, ROOM] - r), 0.0
 
-    square, key, k, last = r * r, w.key, 0, leaps.square.shape[1] - 1
-    while k < last and leaps.square[m, k + 1] <= square:
+    balls, square, key, k, last = leaps.balls, r * r, w.key, 0, leaps.balls.shape[1] - 1
+    while k < last and balls[m, k + 1, 0] <= square:
         k += 1
     key += GOLDEN
     u0, u1 = halves(mix(key))
@@ -86,11 +91,11 @@ def leap(world, batch, w, amounts):
     u2, u3 = halves(mix(key))
     key += GOLDEN
     u4, u5 = halves(mix(key))
-    if k < last and u2 * (leaps.square[m, k + 1] - leaps.square[m, k]) < square - leaps.square[m, k]:
+    if k < last and u2 * (balls[m, k + 1, 0] - balls[m, k, 0]) < square - balls[m, k, 0]:
         k += 1
     i = int(u3 * leaps.kept[m])
-    record, unit = leaps.records[m, k, i], leaps.unit[m]
-    grains = leaps.law[m, k, 2] * (square + 2.0 * leaps.law[m, k, 0] * r + leaps.law[m, k, 1])
+    record, unit = leaps.records[m, k, i], leaps.size[m, UNIT]
+    times = balls[m, k, 3] * (square + 2.0 * balls[m, k, 1] * r + balls[m, k, 2])
 
     z = 1.0 - 2.0 * u0
     co, si = turned(u1)
@@ -116,13 +121,13 @@ def leap(world, batch, w, amounts):
     met = float(record[6])
     if met > 0.0:
         w.pdf = -1.0  # nobody has aimed at a light where this direction was drawn: what it finds counts in full
-    count_of(world, batch, w, amounts, leaps.crossed[m, k, i], (grains, met * grains, key))
+    count_of(world, batch, w, amounts, leaps.crossed[m, k, i], (times, met * times, key))
     w.key = key
     if w.luck < DIM:
         w.key += GOLDEN
         if not lives(w, w.key):
-            return ENDS
-    return LEAPT_ON
+            return ENDS, 0.0
+    return LEAPT_ON, margin + unit * float(record[0])
 
 
 @njit(forceinline=True, **KERNEL)
@@ -140,7 +145,7 @@ def count_of(world, batch, w, amounts, crossed, leapt):
             w.luck += absorption.least[slot] * length
     travel = media.travel[m]
     if travel >= 0:
-        length = world.leaps.unit[m] * times * float(crossed[kinds])
+        length = world.leaps.size[m, UNIT] * times * float(crossed[kinds])
         amounts[travel] += length
         w.luck += absorption.least[travel] * length
     whole = np.int64(grains + halves(key)[1])
@@ -161,7 +166,8 @@ def leaps_of(passages: Sequence[Any], unit: np.ndarray, room: np.ndarray, margin
     passages : sequence of Passage or None
         Of each medium; None where there are no leaps.
     unit, room, margin : (m,) float64
-        See `Leaps`.
+        Unit of the records, and radius of the smallest ball and what is left free around it, infinite and 0 where there
+        are no leaps.
     """
     media, there = len(passages), [one for one in passages if one is not None]
     cells = max((len(one.ahead) for one in there), default=1)
@@ -169,30 +175,23 @@ def leaps_of(passages: Sequence[Any], unit: np.ndarray, room: np.ndarray, margin
     n = max((one.records.shape[1] for one in there), default=1)
     kinds = max((one.crossed.shape[2] for one in there), default=1)
     made = Leaps(
-        unit=unit,
-        room=room,
-        margin=margin,
-        pace=np.ones(media),
-        ahead=np.zeros((media, cells)),
-        aside=np.zeros((media, cells)),
+        size=np.stack((room, margin, np.ones(media), unit), axis=1),
+        middle=np.zeros((media, cells, 2)),
         cells=np.ones(media, np.int64),
-        square=np.ones((media, k)),
-        law=np.zeros((media, k, 3)),
-        records=np.zeros((media, k, n, 7), np.float32),
+        balls=np.ones((media, k, 4)),
+        records=np.zeros((media, k, n, 8), np.float32),
         crossed=np.zeros((media, k, n, kinds), np.float32),
         kept=np.zeros(media, np.int64),
     )
     for m, one in enumerate(passages):
         if one is None:
             continue
-        made.pace[m] = unit[m] * math.sqrt(one.step2)
+        made.size[m, PACE] = unit[m] * math.sqrt(one.step2)
         made.cells[m], made.kept[m] = len(one.ahead), one.records.shape[1]
-        made.ahead[m, : len(one.ahead)] = unit[m] * one.ahead
-        made.aside[m, : len(one.ahead)] = unit[m] * one.aside
-        made.square[m] = (unit[m] * one.radius) ** 2
-        a, b = unit[m] * one.numbers[:, 0], unit[m] ** 2 * one.numbers[:, 1]
-        # Records hold N, so that they are to be taken times reff^2 of the ball over that of their own
-        made.law[m] = np.stack((a, b, 1.0 / (made.square[m] + 2.0 * a * np.sqrt(made.square[m]) + b)), axis=1)
-        made.records[m, :, : one.records.shape[1]] = one.records
+        made.middle[m, : len(one.ahead)] = unit[m] * np.stack((one.ahead, one.aside), axis=1)
+        # N of a ball is to that of a record as their r^2 + 2 A r + B
+        r, a, b = unit[m] * one.radius, unit[m] * one.numbers[:, 0], unit[m] ** 2 * one.numbers[:, 1]
+        made.balls[m] = np.stack((r * r, a, b, 1.0 / (r * r + 2.0 * a * r + b)), axis=1)
+        made.records[m, :, : one.records.shape[1], : one.records.shape[2]] = one.records
         made.crossed[m, :, : one.crossed.shape[1], : one.crossed.shape[2]] = one.crossed
     return made

@@ -20,7 +20,7 @@ from tsdf.sampling import GOLDEN, mix, unit
 from tsdf.spheres.neighbours import Law
 from tsdf.vectors import KERNEL, cross, dot, frame, step, triple
 from tsdf.walk.geometry import clearance
-from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, leap, patience
+from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, leap, missing, patience
 from tsdf.walk.lights import draw as draw_light
 from tsdf.walk.room import MESH, stands
 from tsdf.walk.walker import (
@@ -226,7 +226,7 @@ def roam(world, batch, w, amounts, once):
         t, b, key, free = triple(w.t), w.b, w.key, w.free
     again = NEVER
     if not once and not w.shadow:
-        again = patience(world.leaps, m, world.leaps.room[m] + world.leaps.margin[m] - bound)
+        again = patience(world.leaps, m, missing(world.leaps, m, bound))
     while True:
         if not once and bound <= free:
             if not fresh:
@@ -245,11 +245,11 @@ def roam(world, batch, w, amounts, once):
             write(w.d, d)
             write(w.t, t)
             w.b, w.key, w.luck, w.pdf = b, key, luck, pdf
-            wait = leap(world, batch, w, amounts)
+            wait, bound_there = leap(world, batch, w, amounts)
             again = steps + wait
             if wait <= LEAPT_ON:
                 p, d, t, b, free = triple(w.p), triple(w.d), triple(w.t), w.b, w.free
-                key, luck, pdf, bound = w.key, w.luck, w.pdf, 0.0
+                key, luck, pdf, bound = w.key, w.luck, w.pdf, bound_there
                 if wait == ENDS:
                     state = ENDED
                     break

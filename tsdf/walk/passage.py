@@ -39,7 +39,7 @@ from tsdf.walk.walker import Media, halves
 VERSION = 1  # of records; raised whenever the same arguments give others
 CLASSES = 8  # of radii, each sqrt 2 of the one before
 LEAST_RADIUS = 6.0  # [R] of the first class where grains are spheres: smaller balls are of a few grains
-RECORDS = 8192  # of each class
+RECORDS = 4096  # of each class
 FEWEST = 512  # where light hardly turns, and a record takes very many events
 BUDGET = 3e7  # events that making records may take, unless there would be fewer than that
 DRAWS = 1 << 20  # of deflections, for their means

@@ -33,7 +33,7 @@ from tsdf.walk import explicit as X
 from tsdf.walk import memory as M
 from tsdf.walk.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit
 from tsdf.walk.grid import GRAZING, march, plane_hit
-from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, Leaps, leap, patience
+from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, Leaps, leap, missing, patience
 from tsdf.walk.lights import LightArrays
 from tsdf.walk.lights import draw as draw_light
 from tsdf.walk.lights import radiance as light_from
@@ -277,7 +277,7 @@ def wander(world, batch, w, amounts, once):
     most = min(PATIENCE, media.limit - w.events)
     bound, fresh = clearance(g, m, p), True
     convex, hair = alone(g, m), HAIR * g.slack[m]
-    again = NEVER if once else patience(world.leaps, m, world.leaps.room[m] + world.leaps.margin[m] - bound)
+    again = NEVER if once else patience(world.leaps, m, missing(world.leaps, m, bound))
     while True:
         if free < 0.0:
             key += GOLDEN
@@ -302,7 +302,7 @@ def wander(world, batch, w, amounts, once):
             write(w.p, p)
             write(w.d, d)
             w.key, w.luck, w.pdf = key, luck, pdf
-            wait = leap(world, batch, w, amounts)
+            wait, bound_there = leap(world, batch, w, amounts)
             again = steps + wait
             if wait <= LEAPT_ON:
                 leapt += 1
@@ -310,7 +310,7 @@ def wander(world, batch, w, amounts, once):
                 if wait == ENDS:
                     state = ENDED
                     break
-                bound, most = 0.0, min(most, steps + media.limit - w.events)
+                bound, most = bound_there, min(most, steps + media.limit - w.events)
                 continue
 
         c = first
