@@ -55,6 +55,8 @@ class Picture:
         Paths given up because nothing let their light out, and rays that lost track of a surface.
     interrupted : bool
         Whether it is less than what was asked for because the user stopped it.
+    leapt, leaps : int
+        How many of the events were not drawn one by one, and how many leaps stand for them.
     """
 
     rgb: np.ndarray
@@ -66,6 +68,8 @@ class Picture:
     truncated: int
     faults: int
     interrupted: bool
+    leapt: int = 0
+    leaps: int = 0
 
     @property
     def relative_error(self) -> float:
@@ -346,6 +350,8 @@ class Sums:
             rays=int(counters[W.RAYS]),
             seconds=seconds,
             truncated=int(counters[W.TRUNCATED]),
+            leapt=int(counters[W.LEAPT]),
+            leaps=int(counters[W.LEAPS]),
             faults=int(counters[W.FAULTS]),
             interrupted=interrupted,
         )

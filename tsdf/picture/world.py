@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from tsdf.data import format
 from tsdf.data.sampler import Tables, compile_tables
 from tsdf.data.table import Table
-from tsdf.errors import SceneError, TSDFError
+from tsdf.errors import SceneError, TSDFError, UsageError
 from tsdf.grain.grains import first_hit, load_grain
 from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Effort, exact_sphere
@@ -50,6 +50,7 @@ from tsdf.walk.walker import MAX_EVENTS, Absorption, Media
 
 CAPTIVES = 32  # paths that look for a way out from the camera
 OUTLIVED = 1000.0  # of the grains met in the mean, after which a path that leaps is given up: no light lives as long
+MOST_EVENTS = 1 << 60  # that a walker counts
 BOUNCES = 500  # after which there is none; a hole of a thousandth of all surfaces is found by then
 SLOW = 1e5  # grains met by a path, beyond which it is said how long that takes
 ENDLESS = 1e7  # beyond which a path takes seconds
@@ -65,6 +66,8 @@ class World:
     ----------
     scene : Scene
     level : str
+    leap : float
+        Radius of the smallest leap in transport mean free paths, 0 where no medium is deep enough.
     place : Place
         Geometry and its ray engine.
     packed : Packed
@@ -81,6 +84,7 @@ class World:
 
     scene: Scene
     level: str
+    leap: float
     place: Place
     packed: Packed
     media: Media
@@ -230,7 +234,7 @@ def build(
     """
     if level not in LEVELS:
         raise SceneError(f"{scene.name}: no level {level!r}; levels are {', '.join(LEVELS)}")
-    traits = LEVELS[level].traits
+    traits, gamma = LEVELS[level].traits, _gamma(scene, level, leap)
     read: dict[str, Table] = {}
 
     def table_of(spec: GrainSpec) -> Table:
@@ -262,13 +266,12 @@ def build(
             )
     lights, said = _lights(scene)
     compiled = compile_tables(tables or [_no_table()], joint=traits.joint)
-    leaps, deep = leaping(
-        scene, made, media, compiled, memory, tables, _gamma(scene, level, leap), bool(lights.sampled), progress
-    )
-    events = _grains_met(scene, traits, tables, made, parameters, limit)
+    leaps, deep = leaping(scene, made, media, compiled, memory, tables, gamma, bool(lights.sampled), progress)
+    met = _grains_met(scene, traits, tables, made, parameters, limit)
     if any(deep) and limit == MAX_EVENTS:
-        media = media._replace(limit=int(max(limit, OUTLIVED * max(n for n, there in zip(events, deep, strict=True) if there))))
-    notes += _long_paths(scene, [0.0 if there else n for n, there in zip(events, deep, strict=True)])
+        longest = OUTLIVED * max(n for n, there in zip(met, deep, strict=True) if there)
+        media = media._replace(limit=int(min(max(limit, longest), MOST_EVENTS)))
+    notes += _long_paths(scene, [0.0 if there else n for n, there in zip(met, deep, strict=True)])
     notes += said
     if traits.packed and scene.media and lights.sampled:
         notes.append(
@@ -279,6 +282,7 @@ def build(
     return World(
         scene=scene,
         level=level,
+        leap=gamma if any(deep) else 0.0,
         place=made,
         packed=grains,
         media=media,
@@ -348,13 +352,13 @@ def mean_chord(medium: MediumSpec, boundary: Triangles | None) -> float:
 
 
 def _gamma(scene: Scene, level: str, leap: float | None) -> float:
-    """Return the smallest radius of leaps in transport mean free paths; SceneError where it cannot be what is asked."""
+    """Return the smallest radius of leaps in transport mean free paths; UsageError where it cannot be what is asked."""
     can = LEVELS[level].traits.leaps
     if leap is None:
         named = scene.render.leap
         return (GAMMA if named is None else checked(named)) if can else 0.0
     if checked(leap) and not can:
-        raise SceneError(f"{scene.name}: level {level} cannot leap, for its grains have their places; leave out leap")
+        raise UsageError(f"{scene.name}: level {level} cannot leap, for its grains have their places; leave out leap")
     return leap
 
 
