@@ -42,6 +42,7 @@ from tsdf.spheres.neighbours import law
 from tsdf.vectors import frame
 from tsdf.walk.explicit import Packed, nothing_packed, packed
 from tsdf.walk.geometry import MESH, Place, Triangles, ball_hit, exact_hit, place
+from tsdf.walk.hybrid import hybrid_notes, singles_of
 from tsdf.walk.lights import LUMINANCE, LightArrays, compile_lights
 from tsdf.walk.memory import Memory, memory_of
 from tsdf.walk.transport import Camera
@@ -68,8 +69,10 @@ class World:
     level : str
     place : Place
         Geometry and its ray engine.
+    brim : Place
+        Where the chain goes on after the first grains if that is another place: media that it fills to the brim.
     packed : Packed
-        Grains of the explicit level.
+        Grains that are met one by one.
     media, tables, memory, lights, absorption
         Arrays for kernels.
     amounts : int
@@ -83,6 +86,7 @@ class World:
     scene: Scene
     level: str
     place: Place
+    brim: Place
     packed: Packed
     media: Media
     tables: Tables
@@ -222,7 +226,7 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
     """
     if level not in LEVELS:
         raise SceneError(f"{scene.name}: no level {level!r}; levels are {', '.join(LEVELS)}")
-    traits = LEVELS[level].traits
+    traits, singles = LEVELS[level].traits, singles_of(scene, level)
     read: dict[str, Table] = {}
 
     def table_of(spec: GrainSpec) -> Table:
@@ -234,7 +238,9 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
         return read[file]
 
     tables = [table_of(grain) for medium in scene.media for grain in medium.grains]
-    made = place(scene, grains=traits.placed)
+    made = brim = place(scene, grains=traits.placed or singles > 0)
+    if not traits.placed and singles and any(medium.inside == "centres" for medium in scene.media):
+        brim = place(scene)
     notes = list(made.notes)
     media, absorption, parameters = _media(scene, traits, tables, limit)
     if records := LEVELS[level].records:
@@ -255,18 +261,22 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
     notes += _long_paths(scene, traits, tables, made, parameters, limit)
     lights, said = _lights(scene)
     notes += said
-    if traits.packed and scene.media and lights.sampled:
+    if singles and scene.media and lights.sampled:
         notes.append(
-            f"{scene.name}: level explicit meets suns and small bright lights by chance alone: until many samples "
-            "have, the picture is too dark and its variance does not tell; widen the sun or light by a smooth sky"
+            f"{scene.name}: {'level explicit meets' if traits.packed else 'explicit grains meet'} suns and small "
+            "bright lights by chance alone: until many samples have, the picture is too dark and its variance does not "
+            "tell; widen the sun or light by a smooth sky"
         )
-    grains = packed(scene, tables) if traits.packed and scene.media else nothing_packed(len(scene.media), len(tables))
+    if singles and not traits.packed:
+        notes += hybrid_notes(scene, tables)
+    grains = packed(scene, tables) if singles and scene.media else nothing_packed(len(scene.media), len(tables))
     return World(
         scene=scene,
         level=level,
         place=made,
+        brim=brim,
         packed=grains,
-        media=media,
+        media=media._replace(singles=singles),
         tables=compile_tables(tables or [_no_table()], joint=traits.joint),
         memory=memory,
         lights=lights,

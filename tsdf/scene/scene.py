@@ -46,6 +46,7 @@ MAX_LIGHTS = 64
 MAX_MEDIA = 64
 MAX_SURFACES = 1000
 MAX_SPHERES = 100_000  # in a tile of the explicit level: a minute to pack
+MAX_EXPLICIT = 1_000_000  # grains met one by one before a chain takes over
 MAX_NAME = 200  # [characters]
 METRES_PER_NM = 1e-9
 ABSORBING = tuple(name for name, medium in MEDIA.items() if medium.k is not None)
@@ -73,6 +74,7 @@ class Render:
     level: str = "teleport"  # one of LEVELS
     spp: int = 64  # samples per pixel
     seed: int = 0
+    explicit_grains: int = 0  # met one by one, the first from the camera, before a chain of grains takes over
 
 
 @dataclass(frozen=True)
@@ -213,6 +215,7 @@ class Scene:
     render: Render = Render()
     metres_per_unit: float | None = None  # [m/unit]; given wherever a grain absorbs as a material does
     name: str = "scene"  # what messages call it
+    folder: str | None = None  # where its relative paths started, None if it was made in Python
 
 
 def load(path: str | os.PathLike[str]) -> Scene:
@@ -262,7 +265,7 @@ def parse(data: Mapping[str, Any], folder: str | os.PathLike[str] = ".", name: s
     SceneError
         In one line, with the table, the key and the way out.
     """
-    return replace(_SCENE(data, "the scene", _Place(name, "", Path(folder))), name=name)
+    return replace(_SCENE(data, "the scene", _Place(name, "", Path(folder))), name=name, folder=os.fspath(folder))
 
 
 def called(table: str, number: int, label: str) -> str:
@@ -708,7 +711,15 @@ _SCENE = _table(
     _check_scene,
     metres_per_unit=_POSITIVE,
     camera=_section(_CAMERA),
-    render=_section(_table(Render, level=_choice(LEVELS), spp=_integer(1, MAX_SAMPLES), seed=_integer())),
+    render=_section(
+        _table(
+            Render,
+            level=_choice(LEVELS),
+            spp=_integer(1, MAX_SAMPLES),
+            seed=_integer(),
+            explicit_grains=_integer(0, MAX_EXPLICIT),
+        )
+    ),
     light=_tables("[[light]]", _LIGHT, MAX_LIGHTS),
     medium=_tables("[[medium]]", _MEDIUM, MAX_MEDIA),
     surface=_tables("[[surface]]", _SURFACE, MAX_SURFACES),

@@ -19,6 +19,7 @@ from tsdf.errors import TSDFError, UsageError
 from tsdf.picture import render
 from tsdf.picture.render import Picture
 from tsdf.picture.world import World, build
+from tsdf.scene.levels import LEVELS as MODELS
 from tsdf.scene.scene import LEVELS, Scene
 
 REFERENCES = LEVELS  # best first
@@ -277,6 +278,8 @@ def compare(
     notes: list[str] = []
     references: list[Picture] = []
     rows: list[Row] = []
+    if singles := scene.render.explicit_grains:
+        notes.append(f"the levels that go from grain to grain follow the first {singles} grains as level explicit does")
     level, world = _reference(scene, notes)
     better = REFERENCES[: REFERENCES.index(level)]  # impossible, and noted
     others = [name for name in LEVELS if name in levels and name not in (level, *better)]
@@ -302,7 +305,7 @@ def compare(
         nonlocal world
         for k in range(packings):
             if k and level == "explicit" and scene.media:
-                world = build(_repacked(scene, k), level)
+                world = build(_taken(_repacked(scene, k), level), level)
             time = reference_seconds and reference_seconds / packings
             picture = shot(world, k, f"{level}, picture {k + 1} of {packings}", None if time else spp, time)
             if picture is not None:
@@ -334,7 +337,7 @@ def compare(
             if stop.is_set():
                 break
             try:
-                other = build(scene, name)
+                other = build(_taken(scene, name), name)
             except TSDFError as error:
                 notes.append(f"{name} is skipped: {error}")
                 begun += 1
@@ -380,7 +383,7 @@ def _reference(scene: Scene, notes: list[str]) -> tuple[str, World]:
     first: list[str] = []
     for level in REFERENCES:
         try:
-            world = build(scene, level)
+            world = build(_taken(scene, level), level)
         except TSDFError as error:
             failed = failed or error
             first.append(f"{level} cannot be the reference: {error}")
@@ -389,6 +392,13 @@ def _reference(scene: Scene, notes: list[str]) -> tuple[str, World]:
         return level, world
     assert failed is not None
     raise failed
+
+
+def _taken(scene: Scene, level: str) -> Scene:
+    """Return a scene without the explicit grains that a level cannot take."""
+    if MODELS[level].traits.chains:
+        return scene
+    return replace(scene, render=replace(scene.render, explicit_grains=0))
 
 
 def _repacked(scene: Scene, k: int) -> Scene:
