@@ -15,7 +15,7 @@ import reprlib
 import stat
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from itertools import pairwise
 from numbers import Integral, Real
 from pathlib import Path
@@ -215,7 +215,7 @@ class Scene:
     render: Render = Render()
     metres_per_unit: float | None = None  # [m/unit]; given wherever a grain absorbs as a material does
     name: str = "scene"  # what messages call it
-    folder: str | None = None  # where its relative paths started, None if it was made in Python
+    folder: str | None = field(default=None, compare=False)  # where its paths start; None if it was made in Python
 
 
 def load(path: str | os.PathLike[str]) -> Scene:
