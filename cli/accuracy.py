@@ -56,8 +56,10 @@ def main(
     from tsdf.files import replacing
     from tsdf.scene.scene import GrainSpec
     from tsdf.study import accuracy, plots
+    from tsdf.walk.explicit import mesh_beside
 
     read = format.read(table)
+    mesh = mesh or mesh_beside(read, [table.parent])
     meshes = [] if mesh is None else [mesh]
     check_folder(out, ["accuracy.md", "accuracy.csv", "accuracy.png"], table, *meshes)
     with working(quiet) as work:

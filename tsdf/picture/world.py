@@ -42,6 +42,7 @@ from tsdf.spheres.neighbours import law
 from tsdf.vectors import frame
 from tsdf.walk.explicit import Packed, nothing_packed, packed
 from tsdf.walk.geometry import MESH, Place, Triangles, ball_hit, exact_hit, place
+from tsdf.walk.hybrid import hybrid_notes, singles_of
 from tsdf.walk.leaps import Leaps
 from tsdf.walk.lights import LightArrays, compile_lights
 from tsdf.walk.memory import Memory, memory_of
@@ -70,8 +71,10 @@ class World:
         Radius of the smallest leap in transport mean free paths, 0 where no medium is deep enough.
     place : Place
         Geometry and its ray engine.
+    brim : Place
+        Where the chain goes on after the first grains if that is another place: media that it fills to the brim.
     packed : Packed
-        Grains of the explicit level.
+        Grains that are met one by one.
     media, tables, memory, leaps, lights, absorption
         Arrays for kernels.
     amounts : int
@@ -86,6 +89,7 @@ class World:
     level: str
     leap: float
     place: Place
+    brim: Place
     packed: Packed
     media: Media
     tables: Tables
@@ -234,7 +238,8 @@ def build(
     """
     if level not in LEVELS:
         raise SceneError(f"{scene.name}: no level {level!r}; levels are {', '.join(LEVELS)}")
-    traits, gamma = LEVELS[level].traits, _gamma(scene, level, leap)
+    traits, singles = LEVELS[level].traits, singles_of(scene, level)
+    gamma = _gamma(scene, level, leap)
     read: dict[str, Table] = {}
 
     def table_of(spec: GrainSpec) -> Table:
@@ -246,7 +251,9 @@ def build(
         return read[file]
 
     tables = [table_of(grain) for medium in scene.media for grain in medium.grains]
-    made = place(scene, grains=traits.placed)
+    made = brim = place(scene, grains=traits.placed or singles > 0)
+    if not traits.placed and singles and any(medium.inside == "centres" for medium in scene.media):
+        brim = place(scene)
     notes = list(made.notes)
     media, absorption, parameters = media_of(scene, traits, tables, limit)
     if records := LEVELS[level].records:
@@ -266,26 +273,30 @@ def build(
             )
     lights, said = _lights(scene)
     compiled = compile_tables(tables or [_no_table()], joint=traits.joint)
-    leaps, deep = leaping(scene, made, media, compiled, memory, tables, gamma, bool(lights.sampled), progress)
+    leaps, deep = leaping(scene, brim, media, compiled, memory, tables, gamma, bool(lights.sampled), progress)
     met = _grains_met(scene, traits, tables, made, parameters, limit)
     if any(deep) and limit == MAX_EVENTS:
         longest = OUTLIVED * max(n for n, there in zip(met, deep, strict=True) if there)
         media = media._replace(limit=int(min(max(limit, longest), MOST_EVENTS)))
     notes += _long_paths(scene, [0.0 if there else n for n, there in zip(met, deep, strict=True)])
     notes += said
-    if traits.packed and scene.media and lights.sampled:
+    if singles and scene.media and lights.sampled:
         notes.append(
-            f"{scene.name}: level explicit meets suns and small bright lights by chance alone: until many samples "
-            "have, the picture is too dark and its variance does not tell; widen the sun or light by a smooth sky"
+            f"{scene.name}: {'level explicit meets' if traits.packed else 'explicit grains meet'} suns and small "
+            "bright lights by chance alone: until many samples have, the picture is too dark and its variance does not "
+            "tell; widen the sun or light by a smooth sky"
         )
-    grains = packed(scene, tables) if traits.packed and scene.media else nothing_packed(len(scene.media), len(tables))
+    if singles and not traits.packed:
+        notes += hybrid_notes(scene, tables)
+    grains = packed(scene, tables) if singles and scene.media else nothing_packed(len(scene.media), len(tables))
     return World(
         scene=scene,
         level=level,
         leap=gamma if any(deep) else 0.0,
         place=made,
+        brim=brim,
         packed=grains,
-        media=media,
+        media=media._replace(singles=singles),
         tables=compiled,
         memory=memory,
         leaps=leaps,

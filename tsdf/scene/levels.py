@@ -26,6 +26,11 @@ class Traits(NamedTuple):
         return not self.packed
 
     @property
+    def chains(self) -> bool:
+        """Whether light goes from grain to grain by a law, so that it can begin at any grain; see `walk.hybrid`."""
+        return self.jumps or self.remembers
+
+    @property
     def points(self) -> bool:
         """Whether grains are points, that know no path length inside."""
         return self.lobe or self.similar
