@@ -20,6 +20,7 @@ import numpy as np
 from tsdf.errors import SceneError, UsageError
 from tsdf.handle import Handle
 from tsdf.picture.world import World, camera_of, sees
+from tsdf.walk import packed
 from tsdf.walk import transport as T
 from tsdf.walk import walker as W
 from tsdf.walk.transport import Camera
@@ -95,7 +96,7 @@ class Walkers:
                 world.memory, world.absorption,
             )
         )  # fmt: skip
-        self.place, self.packed = world.place, world.packed
+        self.place, self.packed, self.answered = world.place, world.packed, world.media.traits.answered
         engines, exemplars = len(self.place.engines), len(self.packed.engines)
         self.walkers = [np.zeros(ROOM, W.WALKER) for _ in range(2)]
         self.amounts = [np.zeros((ROOM, world.amounts)) for _ in range(2)]
@@ -144,6 +145,8 @@ class Walkers:
     def turn(self, live: int) -> int:
         """Take the first `live` of ``walkers[0]`` as far as they come without the ray engine, ask it, and return how
         many go on; ``walkers[1]`` then holds what they were, those that have ended as they ended."""
+        if self.answered:
+            packed.answer(self.arrays, self.batches[0], live)
         T.advance(self.arrays, self.batches[0], live)
         live, rays = int(self.asked[W.LIVE]), int(self.asked[W.ASKED])
         if rays:

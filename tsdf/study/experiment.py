@@ -17,7 +17,9 @@ import numpy as np
 from tsdf.data.table import Table
 from tsdf.picture.render import SLOTS, Walkers
 from tsdf.picture.world import World, beam, build
+from tsdf.scene.levels import LEVELS
 from tsdf.scene.scene import Absorption, Camera, ConstantLight, GrainSpec, MediumSpec, Scene, Slab, Sphere
+from tsdf.spheres.around import around_of
 from tsdf.spheres.packing import cells_of, pack
 from tsdf.walk import transport as T
 from tsdf.walk import walker as W
@@ -303,8 +305,10 @@ def _lower(world: World, fraction: float, packing: int, height: float) -> None:
     """Move the spheres of a packed world down, all the same."""
     made = pack(fraction, SPHERES, packing)
     moved = replace(made, centres=(made.centres - (0.0, 0.0, height)) % made.side)
-    arrays = world.packed.arrays
-    world.packed.arrays = arrays._replace(cells=(cells_of(moved),), centres=(np.ascontiguousarray(moved.centres),))
+    around = around_of(moved if world.media.traits.answered else None)
+    world.packed.arrays = world.packed.arrays._replace(
+        cells=(cells_of(moved),), centres=(np.ascontiguousarray(moved.centres),), around=(around,)
+    )
 
 
 def slab_experiment(
@@ -317,7 +321,7 @@ def slab_experiment(
     if coefficients is not None:
         grain = replace(grain, absorption=Absorption("grey", (FAINTEST,)))
     world = build(scene_of(Slab(-layer, 0.0), grain, fraction, packing), level)
-    if level == "explicit":
+    if LEVELS[level].traits.packed:
         _lower(world, fraction, packing, top)
     way = np.array([math.sqrt(1.0 - cosine**2), 0.0, -cosine])
     high = 5.0 + WIDE  # the beam's tilted square begins above the slab
