@@ -22,6 +22,7 @@ from tsdf.errors import SceneError, UsageError
 from tsdf.handle import Handle
 from tsdf.picture.world import World, camera_of, sees
 from tsdf.scene.levels import LEVELS
+from tsdf.walk import packed
 from tsdf.walk import transport as T
 from tsdf.walk import walker as W
 from tsdf.walk.hybrid import ALL
@@ -105,6 +106,7 @@ class Walkers:
             self.near = Handle(near._replace(media=world.media._replace(traits=LEVELS["explicit"].traits)))
             self.arrays = Handle(near._replace(geometry=world.brim.arrays))
         self.place, self.brim, self.packed = world.place, world.brim, world.packed
+        self.answered = world.media.traits.answered
         exemplars = len(self.packed.engines)
         self.walkers = [np.zeros(ROOM, W.WALKER) for _ in range(2)]
         self.amounts = [np.zeros((ROOM, world.amounts)) for _ in range(2)]
@@ -165,6 +167,8 @@ class Walkers:
     def turn(self, live: int) -> int:
         """Take the first `live` of ``walkers[0]`` as far as they come without the ray engine, ask it, and return how
         many go on; ``walkers[1]`` then holds what they were, those that have ended as they ended."""
+        if self.answered:
+            packed.answer(self.arrays, self.batches[0], live)
         T.advance(self.near, self.arrays, self.near_batches[0], self.batches[0], live)
         live, rays = int(self.asked[W.LIVE]), int(self.asked[W.ASKED])
         if rays:

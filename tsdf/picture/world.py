@@ -3,7 +3,7 @@
 Media become numbers in `media`; how light uses them is `transport`, pictures are `render`. The levels, cheapest first:
 isotropic (point scatterers, similarity), volume-hg (one Henyey-Greenstein lobe), volume (tabulated deflections),
 teleport (Algorithm 1 of Meng et al. 2015), teleport-joint (its offsets kept together), teleport-memory (where
-neighbours are as well), explicit (packed grains, traced).
+neighbours are as well), teleport-packed (packed grains, answered by records), explicit (packed grains, traced).
 """
 
 import math
@@ -263,7 +263,7 @@ def build(
                     f"{scene.name}: {grain.table} has no {records.name}, which level {level} draws from; "
                     f"build it with {records.option}"
                 )
-    memory = _memory(scene, tables if traits.remembers else [])
+    memory = _memory(scene, tables if traits.remembers or traits.answered else [], traits.remembers)
     for number, (medium, boundary) in enumerate(zip(scene.media, made.boundaries, strict=True), 1):
         extent = _extent(medium, boundary.vertices if boundary is not None else None)
         if 2.0 * medium.radius > extent and medium.inside == "grains":
@@ -282,13 +282,15 @@ def build(
     notes += said
     if singles and scene.media and lights.sampled:
         notes.append(
-            f"{scene.name}: {'level explicit meets' if traits.packed else 'explicit grains meet'} suns and small "
+            f"{scene.name}: {f'level {level} meets' if traits.packed else 'explicit grains meet'} suns and small "
             "bright lights by chance alone: until many samples have, the picture is too dark and its variance does not "
             "tell; widen the sun or light by a smooth sky"
         )
     if singles and not traits.packed:
         notes += hybrid_notes(scene, tables)
-    grains = packed(scene, tables) if singles and scene.media else nothing_packed(len(scene.media), len(tables))
+    grains = nothing_packed(len(scene.media), len(tables))
+    if singles and scene.media:
+        grains = packed(scene, tables, traced=not traits.answered)
     return World(
         scene=scene,
         level=level,
@@ -308,18 +310,20 @@ def build(
     )
 
 
-def _memory(scene: Scene, tables: list[Table]) -> Memory:
-    """Return what level teleport-memory remembers, of nothing where there are no tables."""
+def _memory(scene: Scene, tables: list[Table], chained: bool) -> Memory:
+    """Return what tables remember of entries and, where light goes from sphere to sphere in a chain, packings of their
+    neighbours; of nothing where there are no tables."""
     if not tables:
         return memory_of([], [], [], [])
     laws, grains, at = [], [], 0
     for number, medium in enumerate(scene.media, 1):
         own = tables[at : at + len(medium.grains)]
         at += len(own)
-        try:
-            laws.append(law(medium.packing_fraction))
-        except TSDFError as error:
-            raise SceneError(f"{scene.name}: {called('medium', number, medium.name)}: {error}") from None
+        if chained:
+            try:
+                laws.append(law(medium.packing_fraction))
+            except TSDFError as error:
+                raise SceneError(f"{scene.name}: {called('medium', number, medium.name)}: {error}") from None
         grains.append([(table, grain.fraction) for grain, table in zip(medium.grains, own, strict=True)])
     fractions = [medium.packing_fraction for medium in scene.media]
     return memory_of(laws, fractions, [medium.radius for medium in scene.media], grains)

@@ -18,6 +18,7 @@ from tsdf.data.table import Table
 from tsdf.picture.render import SLOTS, Walkers
 from tsdf.picture.world import World, beam, build
 from tsdf.scene.scene import Absorption, Camera, ConstantLight, GrainSpec, MediumSpec, Render, Scene, Slab, Sphere
+from tsdf.spheres.around import around_of
 from tsdf.spheres.packing import cells_of, pack
 from tsdf.walk import transport as T
 from tsdf.walk import walker as W
@@ -309,8 +310,10 @@ def _lower(world: World, fraction: float, packing: int, height: float) -> None:
     """Move the spheres of a packed world down, all the same."""
     made = pack(fraction, SPHERES, packing)
     moved = replace(made, centres=(made.centres - (0.0, 0.0, height)) % made.side)
-    arrays = world.packed.arrays
-    world.packed.arrays = arrays._replace(cells=(cells_of(moved),), centres=(np.ascontiguousarray(moved.centres),))
+    around = around_of(moved if world.media.traits.answered else None)
+    world.packed.arrays = world.packed.arrays._replace(
+        cells=(cells_of(moved),), centres=(np.ascontiguousarray(moved.centres),), around=(around,)
+    )
 
 
 def slab_experiment(

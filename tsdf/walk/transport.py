@@ -651,20 +651,23 @@ def pass_through(world, batch, w, amounts, t_b, t, thick):
 
 @njit(**KERNEL)
 def enter(world, w, s, centre, key):
-    """Bring a walker to a grain's bounding sphere at distance s and into the grain's frame."""
+    """Bring a walker to a grain's bounding sphere at distance s and, if the grain is traced, into its frame."""
     grains, media, m = world.grains, world.media, w.medium
     radius = grains.radius[m]
-    x = step(step(triple(w.p), s, triple(w.d)), -1.0, centre)
+    w.component = X.component_of(grains, media.first[m], media.kinds[m], key)
+    w.grain, w.mode, w.state, w.facet, w.pdf, w.ray = key, GRAIN, X.ENTERED, NONE, -1.0, NONE
+    write(w.q, centre)
+    x = step(triple(w.p), s, triple(w.d))
+    if media.traits.answered:
+        write(w.p, x)
+        return
+    x = step(x, -1.0, centre)
     x = (x[0] / radius, x[1] / radius, x[2] / radius)
     size = 1.0 / math.sqrt(dot(x, x))
     p = X.turned(key, (x[0] * size, x[1] * size, x[2] * size), True)
     write(w.p, p)
     write(w.e, p)
     write(w.d, X.turned(key, triple(w.d), True))
-    write(w.q, centre)
-    w.grain, w.mode, w.state, w.facet, w.pdf = key, GRAIN, X.ENTERED, NONE, -1.0
-    w.component = X.component_of(grains, media.first[m], media.kinds[m], key)
-    w.ray = NONE
 
 
 @njit(**KERNEL)
@@ -709,7 +712,12 @@ def in_grain(world, batch, w, amounts, facet):
 
 @njit(**KERNEL)
 def meet_grain(world, batch, w, amounts):
-    """Take a walker on in its grain, or ask the ray engine for the facet that it meets; return what becomes of it."""
+    """Take a walker on in its grain, or ask for the facet that it meets or the record; return what becomes of it."""
+    if world.media.traits.answered:  # by `packed`, between two turns, which may have taken it to its end
+        if w.state & X.LEFT == 0:
+            return WAIT
+        w.mode = FLY
+        return ENDED
     e = world.grains.exemplar[w.component]
     if e == X.EXACT_SPHERE:
         return in_grain(world, batch, w, amounts, NONE)
