@@ -10,7 +10,7 @@ from tsdf.cli.common import Tool, check_output, plain, say, shown_progress, whol
 from tsdf.errors import UsageError
 
 if TYPE_CHECKING:
-    from tsdf.spheres.neighbours import PackingTable
+    from tsdf.spheres.packing_table import PackingTable
 
 
 @click.command("tsdf-packing", cls=Tool)
@@ -77,14 +77,14 @@ def main(
     if file is not None and not info:
         raise UsageError("FILE goes with --info; the table to make is named by --out")
 
-    from tsdf.spheres import neighbours
+    from tsdf.spheres import packing_table
 
     if out is None:
-        for line in _lines(neighbours.shipped() if file is None else neighbours.read(file)):
+        for line in _lines(packing_table.shipped() if file is None else packing_table.read(file)):
             click.echo(plain(line))
         return
     check_output(out)
-    chosen = fractions or neighbours.FRACTIONS
+    chosen = fractions or packing_table.FRACTIONS
     done = 0
     with shown_progress(quiet) as progress:
 
@@ -93,8 +93,8 @@ def main(
             done += 1
             progress(done / len(set(chosen)), f"packing fraction {fraction:g}")
 
-        table = neighbours.tabulate(chosen, packings, spheres, lines, cells, records, seed, progress=told)
-    neighbours.write(table, out)
+        table = packing_table.tabulate(chosen, packings, spheres, lines, cells, records, seed, progress=told)
+    packing_table.write(table, out)
     if not quiet:
         for line in _lines(table, str(out)):
             say(plain(line))

@@ -85,7 +85,7 @@ def main(
 
 def save(world: "World", picture: "Picture", seed: int, out: Path) -> None:
     """Write the EXR, with what it was made by as the attribute ``tsdf_render``, and the PNG beside it."""
-    from tsdf.make import estimate
+    from tsdf import files
     from tsdf.picture import image
 
     facts = {
@@ -96,7 +96,7 @@ def save(world: "World", picture: "Picture", seed: int, out: Path) -> None:
         "events": picture.events,
         "truncated": picture.truncated,
         "faults": picture.faults,
-        "software": estimate.software(),
+        "software": files.software(),
     }
     image.write_exr(out, picture.rgb, picture.variance, {"tsdf_render": json.dumps(facts)})
     image.write_png(out.with_suffix(".png"), picture.rgb, world.scene.camera.exposure)

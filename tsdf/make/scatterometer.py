@@ -20,12 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from tsdf import archive
+from tsdf import archive, files
 from tsdf.data.table import Table
 from tsdf.errors import GrainError, TSDFError, UsageError
 from tsdf.grain.grains import Grain
 from tsdf.grain.optics import Optics
-from tsdf.make import estimate
+from tsdf.make import assemble, statistics
 from tsdf.make import tally as T
 from tsdf.make.crew import PIECE, Crew, Round
 from tsdf.make.exact import exact_table
@@ -92,9 +92,9 @@ class Effort:
             raise UsageError(f"the target error is a total variation between 0 and 1, got {self.target_error:g}")
         if self.paths is not None and self.target_error is not None:
             raise UsageError("give a number of paths or a target error, not both")
-        if self.cells is not None and not (estimate.MIN_CELLS <= self.cells <= estimate.MAX_CELLS):
+        if self.cells is not None and not (statistics.MIN_CELLS <= self.cells <= statistics.MAX_CELLS):
             raise UsageError(
-                f"the cells of theta must be {estimate.MIN_CELLS} to {estimate.MAX_CELLS}, got {self.cells}"
+                f"the cells of theta must be {statistics.MIN_CELLS} to {statistics.MAX_CELLS}, got {self.cells}"
             )
         if not (0 <= self.joint <= MAX_JOINT):
             raise UsageError(f"the joint records per cell must be 0 to {MAX_JOINT}, got {self.joint}")
@@ -254,7 +254,7 @@ class Progress:
     paths: int = 0
     total: int | None = None
     rays: int = 0
-    error: estimate.TableError | None = None
+    error: statistics.TableError | None = None
 
 
 @dataclass
@@ -314,7 +314,7 @@ class Build:
     tally: Tally
     done: Spans = field(default_factory=list)
     judgement: int = CHUNK_MIN
-    _latest: tuple[int, estimate.TableError] | None = None
+    _latest: tuple[int, statistics.TableError] | None = None
 
     @classmethod
     def start(cls, grain: Grain, optics: Optics, effort: Effort) -> "Build":
@@ -332,7 +332,7 @@ class Build:
         """What decides what the paths are; they serve every request of the same origin."""
         return {
             "part_version": PART_VERSION,
-            "software": estimate.software(),
+            "software": files.software(),
             "grain": self.grain,
             "optics": asdict(self.optics),
             "seed": self.effort.seed,
@@ -368,12 +368,12 @@ class Build:
         same = (self.effort.target_error, self.effort.cells) == (stored.effort.target_error, stored.effort.cells)
         self.judgement = stored.judgement if same else 0
 
-    def error(self) -> estimate.TableError | None:
+    def error(self) -> statistics.TableError | None:
         """Return the error of the table that would be made now, with the cells it would have."""
         if not self.tally.scalars[:, T.SCATTERED].any():
             return None
         if self._latest is None or self._latest[0] != self.paths:
-            errors, target = estimate.TableErrors(self.tally, self.effort.cells), self.effort.target_error
+            errors, target = statistics.TableErrors(self.tally, self.effort.cells), self.effort.target_error
             self._latest = self.paths, (errors.fewest(target) if target is not None else None) or errors.best()
         return self._latest[1]
 
@@ -391,7 +391,7 @@ class Build:
         self.judgement = following
         if not self.tally.scalars[:, T.SCATTERED].all():
             return False
-        errors = estimate.TableErrors(self.tally, self.effort.cells)
+        errors = statistics.TableErrors(self.tally, self.effort.cells)
         progress.error = errors.fewest(target) or errors.rough()
         if progress.error.total_variation <= target:
             progress.total = self.judgement = paths
@@ -399,7 +399,7 @@ class Build:
         least, needed = (times * paths for times in errors.needed(target))
         sure = progress.error.sampling_noise < 0.5 * target
         if math.isinf(least) or (sure and least > REASONABLE):
-            finest = errors(self.effort.cells or estimate.MAX_CELLS)
+            finest = errors(self.effort.cells or statistics.MAX_CELLS)
             more = "allow more --cells, or give" if self.effort.cells else "give"
             raise UsageError(
                 f"--target-error {target:g} is out of reach"
@@ -624,7 +624,7 @@ class Build:
             "max_bounces": made.max_bounces,
         }
         tally = self.tally.narrowed(made.joint, made.memory)
-        return estimate.traced_table(tally, error.cells, self.grain, self.optics, provenance, made.memory)
+        return assemble.traced_table(tally, error.cells, self.grain, self.optics, provenance, made.memory)
 
     def save(self, path: Path) -> None:
         """Write the part file, atomically.
@@ -654,7 +654,7 @@ class Build:
         try:
             arrays = archive.read(path, PART_LIMIT)
             request = json.loads(arrays.pop(archive.PART).tobytes())
-            if (request["part_version"], request["software"]) != (PART_VERSION, estimate.software()):
+            if (request["part_version"], request["software"]) != (PART_VERSION, files.software()):
                 made = printable(str(request["software"]))[:100]
                 raise TSDFError(f"{path}: made by another version ({made}): build it again")
             kept, done = arrays.pop("records_kept"), arrays.pop("done")

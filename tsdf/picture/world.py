@@ -37,7 +37,7 @@ from tsdf.scene.scene import (
     SunLight,
     called,
 )
-from tsdf.spheres.neighbours import law
+from tsdf.spheres.packing_table import law
 from tsdf.vectors import frame
 from tsdf.walk.explicit import Packed, nothing_packed, packed
 from tsdf.walk.geometry import MESH, Place, Triangles, ball_hit, exact_hit, place
