@@ -55,6 +55,8 @@ class Picture:
         Paths given up because nothing let their light out, and rays that lost track of a surface.
     interrupted : bool
         Whether it is less than what was asked for because the user stopped it.
+    leapt, leaps : int
+        How many of the events were not drawn one by one, and how many leaps stand for them.
     """
 
     rgb: np.ndarray
@@ -66,6 +68,8 @@ class Picture:
     truncated: int
     faults: int
     interrupted: bool
+    leapt: int = 0
+    leaps: int = 0
 
     @property
     def relative_error(self) -> float:
@@ -85,7 +89,7 @@ class Walkers:
         Walkers under way, and what they were.
     radiance : (n, 3) float64
         Found so far by each sample; `reserve` makes room.
-    counters : (4,) int64
+    counters : (6,) int64
         See `walker.EVENTS`.
     """
 
@@ -93,7 +97,7 @@ class Walkers:
         self.arrays = Handle(
             T.WorldArrays(
                 world.place.arrays, world.place.room, world.media, world.tables, world.lights, world.packed.arrays,
-                world.memory, world.absorption,
+                world.memory, world.leaps, world.absorption,
             )
         )  # fmt: skip
         self.place, self.packed = world.place, world.packed
@@ -104,7 +108,7 @@ class Walkers:
         self.grain_hits = np.full((exemplars, ROOM), -1, np.int32)
         self.starts, self.ways = (np.zeros((ROOM, 3), np.float32) for _ in range(2))
         self.grain_starts, self.grain_ways = (np.zeros((exemplars, ROOM, 3), np.float32) for _ in range(2))
-        self.counters = np.zeros(4, np.int64)
+        self.counters = np.zeros(6, np.int64)
         self.asked = np.zeros(W.GRAINS_ASKED + exemplars, np.int64)
         self.radiance = np.zeros((0, 3))
         self.reserve(1)
@@ -346,6 +350,8 @@ class Sums:
             rays=int(counters[W.RAYS]),
             seconds=seconds,
             truncated=int(counters[W.TRUNCATED]),
+            leapt=int(counters[W.LEAPT]),
+            leaps=int(counters[W.LEAPS]),
             faults=int(counters[W.FAULTS]),
             interrupted=interrupted,
         )

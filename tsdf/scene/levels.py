@@ -21,6 +21,11 @@ class Traits(NamedTuple):
         return self.remembers or self.packed
 
     @property
+    def leaps(self) -> bool:
+        """Whether many events can be taken in one step: grains are drawn anew wherever light comes."""
+        return not self.packed
+
+    @property
     def points(self) -> bool:
         """Whether grains are points, that know no path length inside."""
         return self.lobe or self.similar

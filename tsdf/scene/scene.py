@@ -73,6 +73,7 @@ class Render:
     level: str = "teleport"  # one of LEVELS
     spp: int = 64  # samples per pixel
     seed: int = 0
+    leap: float | None = None  # smallest leap [transport mean free paths], 0 for none; None where it is not said
 
 
 @dataclass(frozen=True)
@@ -692,6 +693,20 @@ _SURFACE = _table(
     shape=_section(_tagged(rectangle=_RECTANGLE, mesh=_MESH, box=_BOX, sphere=_SPHERE)),
     reflectance=_colour(1.0),
 )
+def _leap(value: Any, key: str, at: _Place) -> float:
+    """Read the smallest radius of leaps: 0 for none, else 1 or more."""
+    leap: float = _number(0.0)(value, key, at)
+    if 0.0 < leap < 1.0:
+        at.fail(f"{key} must be 0 (none) or at least 1, not {leap:g}; leaps that short are biased")
+    return leap
+
+
+def _check_render(render: Render, at: _Place) -> Render:
+    if render.leap and not levels.LEVELS[render.level].traits.leaps:
+        at.fail(f"level {render.level} cannot leap, for its grains have their places; leave out leap, or say 0")
+    return render
+
+
 _CAMERA = _table(
     Camera,
     _check_camera,
@@ -708,7 +723,11 @@ _SCENE = _table(
     _check_scene,
     metres_per_unit=_POSITIVE,
     camera=_section(_CAMERA),
-    render=_section(_table(Render, level=_choice(LEVELS), spp=_integer(1, MAX_SAMPLES), seed=_integer())),
+    render=_section(
+        _table(
+            Render, _check_render, level=_choice(LEVELS), spp=_integer(1, MAX_SAMPLES), seed=_integer(), leap=_leap
+        )
+    ),
     light=_tables("[[light]]", _LIGHT, MAX_LIGHTS),
     medium=_tables("[[medium]]", _MEDIUM, MAX_MEDIA),
     surface=_tables("[[surface]]", _SURFACE, MAX_SURFACES),

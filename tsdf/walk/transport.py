@@ -33,6 +33,7 @@ from tsdf.walk import explicit as X
 from tsdf.walk import memory as M
 from tsdf.walk.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit
 from tsdf.walk.grid import GRAZING, march, plane_hit
+from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, Leaps, leap, missing, patience
 from tsdf.walk.lights import LightArrays
 from tsdf.walk.lights import draw as draw_light
 from tsdf.walk.lights import radiance as light_from
@@ -84,6 +85,7 @@ class WorldArrays(NamedTuple):
     lights: LightArrays
     grains: X.Grains
     memory: M.Memory
+    leaps: Leaps
     absorption: Absorption
 
 
@@ -271,10 +273,11 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
     p, d, key, free = triple(w.p), triple(w.d), w.key, w.free
     mean, reach, travel = media.free[m], media.reach[m], media.travel[m]
     first, last = media.first[m], media.first[m] + media.kinds[m] - 1
-    luck, pdf, steps, state = w.luck, w.pdf, 0, LOOK
-    patience = min(PATIENCE, media.limit - w.events)
+    luck, pdf, steps, leapt, state = w.luck, w.pdf, 0, 0, LOOK
+    most = min(PATIENCE, media.limit - w.events)
     bound, fresh = clearance(g, m, p), True
     convex, hair = alone(g, m), HAIR * g.slack[m]
+    again = NEVER if once else patience(world.leaps, m, missing(world.leaps, m, bound))
     while True:
         if free < 0.0:
             key += GOLDEN
@@ -284,7 +287,7 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
                 bound = clearance(g, m, p)
             if bound <= free and not (convex and bound > 0.0 and clearance(g, m, step(p, free, d)) > hair):
                 break
-        if steps >= patience or (not once and full(batch)):
+        if steps >= most or (not once and full(batch)):
             state = WAIT
             break
         fresh = False
@@ -295,6 +298,20 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
             amounts[travel] += free
             luck += absorption.least[travel] * free
         free = -1.0
+        if steps >= again:
+            write(w.p, p)
+            write(w.d, d)
+            w.key, w.luck, w.pdf = key, luck, pdf
+            wait, bound_there = leap(world, batch, w, amounts)
+            again = steps + wait
+            if wait <= LEAPT_ON:
+                leapt += 1
+                p, d, key, free, luck, pdf = triple(w.p), triple(w.d), w.key, w.free, w.luck, w.pdf
+                if wait == ENDS:
+                    state = ENDED
+                    break
+                bound, most = bound_there, min(most, steps + media.limit - w.events)
+                continue
 
         c = first
         if last > first:
@@ -345,8 +362,8 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
             luck = w.luck
         if once:
             break
-    batch.counters[EVENTS] += steps
-    w.events += steps
+    batch.counters[EVENTS] += steps - leapt
+    w.events += steps - leapt
     write(w.p, p)
     write(w.d, d)
     w.key, w.free, w.luck, w.pdf = key, free, luck, pdf
