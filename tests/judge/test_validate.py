@@ -16,7 +16,9 @@ from tsdf.data import format
 from tsdf.data.table import Table, thawed
 from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
-from tsdf.judge.validate import CODES, judge, reference, validate, zhou_curve
+from tsdf.judge.court import CODES
+from tsdf.judge.physics import reference, zhou_curve
+from tsdf.judge.validate import judge, validate
 from tsdf.make import assemble
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.make.tally import Tally

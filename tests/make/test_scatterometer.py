@@ -21,7 +21,9 @@ from tsdf.grain.optics import Optics
 from tsdf.judge import analytic
 from tsdf.make import assemble, scatterometer, statistics
 from tsdf.make import tally as T
-from tsdf.make.scatterometer import Build, Effort, chunks, merge
+from tsdf.make.origin import grain_header
+from tsdf.make.scatterometer import Build, Effort, merge
+from tsdf.make.spans import CHUNK_MIN, chunks
 from tsdf.make.tally import Tally
 
 
@@ -309,7 +311,7 @@ def test_chunks_cover_all_paths_once() -> None:
         limits = list(chunks(paths))
         assert limits[0][0] == 0 and limits[-1][1] == paths
         assert all(a[1] == b[0] for a, b in itertools.pairwise(limits))
-        assert all(b - a <= max(scatterometer.CHUNK_MIN, a // 8) for a, b in limits)
+        assert all(b - a <= max(CHUNK_MIN, a // 8) for a, b in limits)
 
 
 # ------------------------------------------------------------------------------------------ effort and errors
@@ -585,7 +587,7 @@ def test_means_lie_in_their_cells(tmp_path: Path) -> None:
         cell = np.searchsorted(T.L_EDGES, length, side="right") - 1 if length else 0
         tally.cells[0, T.AT_L + min(cell, T.L - 1)] += energy
         tally.cells[0, T.AT_L_SUM + min(cell, T.L - 1)] += math.floor(energy * length + 0.5)
-    grain = scatterometer.grain_header(load_grain("cube"))
+    grain = grain_header(load_grain("cube"))
     made = {"method": "traced", "command": "", "seed": 0, "paths": 64, "max_bounces": 1}
     table = assemble.traced_table(tally, 64, grain, Optics(1.31), made)
     tsdf.write(table, tmp_path / "t.tsdf.exr")
