@@ -1,6 +1,7 @@
 """``tsdf-render``: a scene in, a picture out."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,10 @@ if TYPE_CHECKING:
     help="Picture to write, NAME.exr (linear RGB and the variance of each pixel); NAME.png is written beside it.",
 )  # fmt: skip
 @click.option("--level", type=click.Choice(LEVELS), help="How grains are modelled.  [default: the scene's]")
+@click.option(
+    "--explicit-grains", type=int, metavar="K",
+    help="Follow the first K grains from the camera one by one, then as the level does.  [default: the scene's]",
+)  # fmt: skip
 @click.option("--spp", type=int, metavar="N", help="Samples per pixel.  [default: the scene's]")
 @click.option("--seconds", type=float, metavar="S", help="Stop after S seconds instead.")
 @click.option(
@@ -37,8 +42,9 @@ if TYPE_CHECKING:
 @click.option("--threads", type=int, metavar="N", help="[default: all processors]")
 @click.option("--quiet", is_flag=True, help="No progress bar, no summary.")
 def main(
-    scene: Path, out: Path, level: str | None, spp: int | None, seconds: float | None, target_error: float | None,
-    seed: int | None, width: int | None, leap: float | None, threads: int | None, quiet: bool,
+    scene: Path, out: Path, level: str | None, explicit_grains: int | None, spp: int | None, seconds: float | None,
+    target_error: float | None, seed: int | None, width: int | None, leap: float | None, threads: int | None,
+    quiet: bool,
 ) -> int:  # fmt: skip
     """Render the picture of SCENE, a TOML file.
 
@@ -51,6 +57,8 @@ def main(
     if out.suffix.lower() != ".exr":
         raise UsageError(f"--out {plain(out)}: is to end in .exr")
     check_numbers(seed, spp=spp, width=width, threads=threads)
+    if explicit_grains is not None and explicit_grains < 0:
+        raise UsageError(f"--explicit-grains is a whole number, 0 for none, not {explicit_grains}")
     for name, limit in (("--seconds", seconds), ("--target-error", target_error)):
         if limit is not None and not 0.0 < limit < float("inf"):
             raise UsageError(f"{name} is a finite number above 0, not {limit:g}")
@@ -58,11 +66,14 @@ def main(
         raise UsageError("--spp, --seconds and --target-error each say when to stop: give one")
 
     from tsdf.picture import image, leaping, render, world
-    from tsdf.scene.scene import files_of, load, resized
+    from tsdf.scene.scene import MAX_EXPLICIT, files_of, load, resized
 
     if leap is not None:
         leaping.checked(leap, "--leap")
     read = resized(load(scene), width)
+    if explicit_grains is not None:
+        most = min(explicit_grains, MAX_EXPLICIT)  # no path meets so many
+        read = replace(read, render=replace(read.render, explicit_grains=most))
     check_output(out, scene, *files_of(read), beside=[out.with_suffix(".png")])
     if spp is None and seconds is None and target_error is None:
         spp = read.render.spp
@@ -108,6 +119,8 @@ def save(world: "World", picture: "Picture", seed: int, out: Path) -> None:
         "faults": picture.faults,
         "software": files.software(),
     }
+    if singles := world.scene.render.explicit_grains:
+        facts["explicit_grains"] = singles
     image.write_exr(out, picture.rgb, picture.variance, {"tsdf_render": json.dumps(facts)})
     image.write_png(out.with_suffix(".png"), picture.rgb, world.scene.camera.exposure)
 
@@ -116,9 +129,11 @@ def summary(world: "World", picture: "Picture", out: Path) -> None:
     """Say on standard output what the picture holds."""
     low, high = int(picture.samples.min()), int(picture.samples.max())
     held = f"{low}" if low == high else f"{low} to {high}"
+    singles = world.scene.render.explicit_grains
+    after = f" after {singles} explicit grains" if singles else ""
     state = "interrupted: holds" if picture.interrupted else "holds"
     say(
-        f"{plain(out)}: {state} {held} samples per pixel, level {world.level}, relative error "
+        f"{plain(out)}: {state} {held} samples per pixel, level {world.level}{after}, relative error "
         f"{picture.relative_error:.2g}, {picture.seconds:.1f} s, {picture.events / max(picture.seconds, 1e-9):.3g} "
         "grain events per second"
     )

@@ -21,8 +21,11 @@ import numpy as np
 from tsdf.errors import SceneError, UsageError
 from tsdf.handle import Handle
 from tsdf.picture.world import World, camera_of, sees
+from tsdf.scene.levels import LEVELS
+from tsdf.walk import packed
 from tsdf.walk import transport as T
 from tsdf.walk import walker as W
+from tsdf.walk.hybrid import ALL
 from tsdf.walk.transport import Camera
 
 SLOTS = 2048  # walkers under way at once, per thread, but for shadows: their state stays in the second-level cache
@@ -94,17 +97,23 @@ class Walkers:
     """
 
     def __init__(self, world: World) -> None:
-        self.arrays = Handle(
-            T.WorldArrays(
-                world.place.arrays, world.place.room, world.media, world.tables, world.lights, world.packed.arrays,
-                world.memory, world.leaps, world.absorption,
-            )
+        near = T.WorldArrays(
+            world.place.arrays, world.place.room, world.media, world.tables, world.lights, world.packed.arrays,
+            world.memory, world.leaps, world.absorption,
         )  # fmt: skip
-        self.place, self.packed = world.place, world.packed
-        engines, exemplars = len(self.place.engines), len(self.packed.engines)
+        self.near = self.arrays = Handle(near)
+        if 0 < world.media.singles < ALL:  # another level's law takes over, where it may have more or less room
+            self.near = Handle(near._replace(media=world.media._replace(traits=LEVELS["explicit"].traits)))
+            self.arrays = Handle(near._replace(geometry=world.brim.arrays))
+        self.place, self.brim, self.packed = world.place, world.brim, world.packed
+        self.answered = world.media.traits.answered
+        exemplars = len(self.packed.engines)
         self.walkers = [np.zeros(ROOM, W.WALKER) for _ in range(2)]
         self.amounts = [np.zeros((ROOM, world.amounts)) for _ in range(2)]
-        self.hits = np.full((ROOM + 1, engines), -1, np.int32)
+        self.near_hits = np.full((ROOM + 1, len(self.place.engines)), -1, np.int32)
+        self.hits = self.near_hits
+        if self.brim is not self.place:
+            self.hits = np.full((ROOM + 1, len(self.brim.engines)), -1, np.int32)
         self.grain_hits = np.full((exemplars, ROOM), -1, np.int32)
         self.starts, self.ways = (np.zeros((ROOM, 3), np.float32) for _ in range(2))
         self.grain_starts, self.grain_ways = (np.zeros((exemplars, ROOM, 3), np.float32) for _ in range(2))
@@ -117,14 +126,23 @@ class Walkers:
         """Let so many samples have found nothing yet."""
         if len(self.radiance) < samples:
             self.radiance = np.zeros((samples, 3))
-            self.batches = [Handle(batch) for batch in (self._batch(0, 1), self._batch(1, 0))]
+            self._lay_out()
         self.radiance[:samples] = 0.0
 
-    def _batch(self, now: int, then: int) -> W.Batch:
-        return W.Batch(
-            self.walkers[now], self.amounts[now], self.walkers[then], self.amounts[then], self.hits, self.grain_hits,
-            self.starts, self.ways, self.grain_starts, self.grain_ways, self.radiance, self.counters, self.asked,
-        )  # fmt: skip
+    def _lay_out(self) -> None:
+        """Make the handles of both directions, and those of the single grains, whose ray engine is another."""
+        batches = [
+            W.Batch(
+                self.walkers[now], self.amounts[now], self.walkers[then], self.amounts[then], self.hits,
+                self.grain_hits, self.starts, self.ways, self.grain_starts, self.grain_ways, self.radiance,
+                self.counters, self.asked,
+            )
+            for now, then in ((0, 1), (1, 0))
+        ]  # fmt: skip
+        self.batches = [Handle(batch) for batch in batches]
+        self.near_batches = self.batches.copy()
+        if self.hits is not self.near_hits:
+            self.near_batches = [Handle(batch._replace(hits=self.near_hits)) for batch in batches]
 
     def follow(self, job: T.Job, pixels: int, stop: threading.Event) -> np.ndarray:
         """Return the radiance (pixels, spp, 3) of the samples of a job, of so many pixels.
@@ -149,15 +167,19 @@ class Walkers:
     def turn(self, live: int) -> int:
         """Take the first `live` of ``walkers[0]`` as far as they come without the ray engine, ask it, and return how
         many go on; ``walkers[1]`` then holds what they were, those that have ended as they ended."""
-        T.advance(self.arrays, self.batches[0], live)
+        if self.answered:
+            packed.answer(self.arrays, self.batches[0], live)
+        T.advance(self.near, self.arrays, self.near_batches[0], self.batches[0], live)
         live, rays = int(self.asked[W.LIVE]), int(self.asked[W.ASKED])
         if rays:
-            self.place.hits(self.starts[:rays], self.ways[:rays], self.hits.T)
+            self.place.hits(self.starts[:rays], self.ways[:rays], self.near_hits.T)
+            if self.brim is not self.place:
+                self.brim.hits(self.starts[:rays], self.ways[:rays], self.hits.T)
         for e, asked in enumerate(self.asked[W.GRAINS_ASKED :]):
             if asked:
                 starts, ways = self.grain_starts[e, :asked], self.grain_ways[e, :asked]
                 self.grain_hits[e, :asked] = self.packed.hits(e, starts, ways)
-        for pair in (self.batches, self.walkers, self.amounts):
+        for pair in (self.batches, self.near_batches, self.walkers, self.amounts):
             pair.reverse()
         return live
 

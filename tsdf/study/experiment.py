@@ -17,7 +17,8 @@ import numpy as np
 from tsdf.data.table import Table
 from tsdf.picture.render import SLOTS, Walkers
 from tsdf.picture.world import World, beam, build
-from tsdf.scene.scene import Absorption, Camera, ConstantLight, GrainSpec, MediumSpec, Scene, Slab, Sphere
+from tsdf.scene.scene import Absorption, Camera, ConstantLight, GrainSpec, MediumSpec, Render, Scene, Slab, Sphere
+from tsdf.spheres.around import around_of
 from tsdf.spheres.packing import cells_of, pack
 from tsdf.walk import transport as T
 from tsdf.walk import walker as W
@@ -309,21 +310,24 @@ def _lower(world: World, fraction: float, packing: int, height: float) -> None:
     """Move the spheres of a packed world down, all the same."""
     made = pack(fraction, SPHERES, packing)
     moved = replace(made, centres=(made.centres - (0.0, 0.0, height)) % made.side)
-    arrays = world.packed.arrays
-    world.packed.arrays = arrays._replace(cells=(cells_of(moved),), centres=(np.ascontiguousarray(moved.centres),))
+    around = around_of(moved if world.media.traits.answered else None)
+    world.packed.arrays = world.packed.arrays._replace(
+        cells=(cells_of(moved),), centres=(np.ascontiguousarray(moved.centres),), around=(around,)
+    )
 
 
 def slab_experiment(
     level: str, grain: GrainSpec, fraction: float, layer: float, cosine: float = 1.0, packing: int = 0,
-    coefficients: Sequence[float] | None = None, top: float = 0.0, leap: float = 0.0,
+    coefficients: Sequence[float] | None = None, top: float = 0.0, leap: float = 0.0, singles: int = 0,
 ) -> Experiment:  # fmt: skip
     """Return what `slab` measures: reflectance, transmittance and profile one after the other, and so again for each of
     several absorption coefficients [1/R] if they are given, of the very same paths. The layer's
-    upper end is at height `top` of the tile."""
+    upper end is at height `top` of the tile; the first `singles` grains are met one by one."""
     if coefficients is not None:
         grain = replace(grain, absorption=Absorption("grey", (FAINTEST,)))
-    world = build(scene_of(Slab(-layer, 0.0), grain, fraction, packing), level, leap=leap)
-    if level == "explicit":
+    scene = replace(scene_of(Slab(-layer, 0.0), grain, fraction, packing), render=Render(explicit_grains=singles))
+    world = build(scene, level, leap=leap)
+    if world.media.singles:
         _lower(world, fraction, packing, top)
     way = np.array([math.sqrt(1.0 - cosine**2), 0.0, -cosine])
     high = 5.0 + WIDE  # the beam's tilted square begins above the slab

@@ -148,6 +148,34 @@ def begin(w, memory):
     w.b = b
 
 
+@njit(forceinline=True, **KERNEL)
+def sent_on(memory, c, column, u, t, d):
+    """Return what a grain of component c does to light along d that meets it on side t, its impact parameter in that
+    column, by the record that u stands for: direction, side and impact parameter of the exit, path length [R]."""
+    grain = memory.grains[c, column, int(u * memory.kept[c])]
+    up = cross(d, t)
+    x, y, z = float(grain[0]), float(grain[1]), float(grain[2])
+    new = step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d)
+    half = 1.5 - 0.5 * dot(new, new)
+    new = (new[0] * half, new[1] * half, new[2] * half)
+    x, y, z = float(grain[3]), float(grain[4]), float(grain[5])
+    t = upright(step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d), new)
+    return new, t, float(grain[6]), float(grain[7])
+
+
+@njit(**KERNEL)
+def emerge(w, memory, n):
+    """Draw the sphere that a walker enters next, which has just left one where the outward normal is n."""
+    m, d = w.medium, triple(w.d)
+    away = step(n, -dot(n, d), d)
+    b = math.sqrt(dot(away, away))
+    t = (away[0] / b, away[1] / b, away[2] / b) if b > 1e-9 else frame(d)[0]
+    w.key += GOLDEN
+    gap, t, w.b = onward(memory, m, d, t, min(b, 1.0), mix(w.key))
+    write(w.t, t)
+    w.free = memory.radius[m] * gap
+
+
 @njit(**KERNEL)
 def connect(world, batch, w, amounts, p, c, share, bound):
     """Send off light that arrives from a light and is deflected into the walker's path by a grain.
@@ -200,13 +228,7 @@ def connect(world, batch, w, amounts, p, c, share, bound):
     if media.slot[c] >= 0:
         its_amounts[media.slot[c]] += media.scale[c] * float(grain[7])
     cast(w, shadow, step(centre, radius, n), toward, light, phase / (light_pdf + phase) / share, m, key)
-    away = step(n, -dot(n, toward), toward)
-    b = math.sqrt(dot(away, away))
-    t = (away[0] / b, away[1] / b, away[2] / b) if b > 1e-9 else frame(toward)[0]
-    shadow.key += GOLDEN
-    gap, t, shadow.b = onward(memory, m, toward, t, min(b, 1.0), mix(shadow.key))
-    write(shadow.t, t)
-    shadow.free = radius * gap
+    emerge(shadow, memory, n)
 
 
 @njit(**KERNEL)

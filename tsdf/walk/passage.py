@@ -306,7 +306,11 @@ def _of_memory(memory: M.Memory, m: int, first: int, kinds: int) -> Means:
     on, beside = mean_gap + to @ ahead, to_side @ aside
     square = ((gap + ahead[there]) ** 2 + aside[there] ** 2).mean(axis=1)
     each = exits @ square + missed * (
-        4.0 * (1.0 - middle - into * ahead) + ahead**2 + aside**2 + 2.0 * (2.0 * into - ahead) * on[own] - 2.0 * aside * beside[own]
+        4.0 * (1.0 - middle - into * ahead)
+        + ahead**2
+        + aside**2
+        + 2.0 * (2.0 * into - ahead) * on[own]
+        - 2.0 * aside * beside[own]
     )
     forward, sideways, e, f = ahead[:, None], aside[:, None], into[:, None], off[:, None]
     for weight, cell, x, z, tx, tz, out, a, nx, nz in parts:
@@ -371,7 +375,9 @@ def made(
         records = np.zeros((CLASSES, count, COLUMNS))
         crossed = np.zeros((CLASSES, count, kinds + 1))
         parts = 8
-        jobs = [(k, count * i // parts, count * (i + 1) // parts) for k in reversed(range(CLASSES)) for i in range(parts)]
+        jobs = [
+            (k, count * i // parts, count * (i + 1) // parts) for k in reversed(range(CLASSES)) for i in range(parts)
+        ]
 
         def one(job: tuple[int, int, int]) -> float:
             k, first, last = job
