@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsdf.cli.common import Tool, check_output, plain, say, shown_progress, whole_number
+from tsdf.cli.common import Tool, check_output, plain, say, seed_option, shown_progress, whole_number
 from tsdf.errors import UsageError
 
 if TYPE_CHECKING:
@@ -51,9 +51,7 @@ if TYPE_CHECKING:
 @click.option(
     "--records", callback=whole_number, default="256", metavar="K", show_default=True, help="Records of each cell."
 )
-@click.option(
-    "--seed", callback=whole_number, default="0", metavar="N", show_default=True, help="Seed of the random numbers."
-)
+@seed_option("0")
 @click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
 def main(
     file: Path | None,
