@@ -38,7 +38,7 @@ from tsdf.scene.scene import (
     SunLight,
     called,
 )
-from tsdf.spheres.neighbours import law
+from tsdf.spheres.packing_table import law
 from tsdf.vectors import frame
 from tsdf.walk.explicit import Packed, nothing_packed, packed
 from tsdf.walk.geometry import MESH, Place, Triangles, ball_hit, exact_hit, place
@@ -226,8 +226,8 @@ def build(
     limit : int
         Grains met after which a path is given up; many more, if it is not given, where paths leap over most of them.
     leap : float, optional
-        Radius of the smallest leap in transport mean free paths, 0 for none; else what the scene says, or `GAMMA`, where
-        the level leaps at all.
+        Radius of the smallest leap in transport mean free paths, 0 for none; else what the scene says, or `GAMMA`,
+        where the level leaps at all.
     progress : callable, optional
         Called with the share done and a word about it while records for leaps are made.
 
