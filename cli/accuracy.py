@@ -7,7 +7,7 @@ import click
 from tsdf.cli.common import Tool, check_folder, check_numbers, named_levels, plain, say, working
 from tsdf.cli.start import interrupt_status, interrupted, interruptible
 
-MEASURED = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume")
+MEASURED = ("explicit", "teleport-packed", "teleport-memory", "teleport-joint", "teleport", "volume")
 
 
 @click.command("tsdf-accuracy", cls=Tool)
@@ -31,7 +31,9 @@ MEASURED = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume
     help="Time of measuring, after a start that makes packings and compiles once for this machine.  [default: 300]",
 )  # fmt: skip
 @click.option("--paths", type=int, metavar="N", help="Paths of each slab, level and packing instead.")
-@click.option("--packings", type=int, default=4, metavar="K", show_default=True, help="Packings behind explicit.")
+@click.option(
+    "--packings", type=int, default=4, metavar="K", show_default=True, help="Packings behind levels of packed grains."
+)
 @click.option("--seed", type=int, default=0, metavar="N", show_default=True, help="Of the random numbers, >= 0.")
 @click.option("--threads", type=int, metavar="N", help="[default: all processors]")
 @click.option("--quiet", is_flag=True, help="No progress bar, no table.")

@@ -34,11 +34,17 @@ if TYPE_CHECKING:
 )  # fmt: skip
 @click.option("--seed", type=int, metavar="N", help="Of the random numbers, >= 0.  [default: the scene's]")
 @click.option("--width", type=int, metavar="PIXELS", help="Width of the picture; its shape is kept.")
+@click.option(
+    "--leap", type=float, metavar="G",
+    help="Take many events in one step where nothing is nearer than G transport mean free paths; 0 never does.  "
+    "[default: the scene's, else 2]",
+)  # fmt: skip
 @click.option("--threads", type=int, metavar="N", help="[default: all processors]")
 @click.option("--quiet", is_flag=True, help="No progress bar, no summary.")
 def main(
     scene: Path, out: Path, level: str | None, explicit_grains: int | None, spp: int | None, seconds: float | None,
-    target_error: float | None, seed: int | None, width: int | None, threads: int | None, quiet: bool,
+    target_error: float | None, seed: int | None, width: int | None, leap: float | None, threads: int | None,
+    quiet: bool,
 ) -> int:  # fmt: skip
     """Render the picture of SCENE, a TOML file.
 
@@ -59,9 +65,11 @@ def main(
     if sum(stop is not None for stop in (spp, seconds, target_error)) > 1:
         raise UsageError("--spp, --seconds and --target-error each say when to stop: give one")
 
-    from tsdf.picture import image, render, world
+    from tsdf.picture import image, leaping, render, world
     from tsdf.scene.scene import MAX_EXPLICIT, files_of, load, resized
 
+    if leap is not None:
+        leaping.checked(leap, "--leap")
     read = resized(load(scene), width)
     if explicit_grains is not None:
         most = min(explicit_grains, MAX_EXPLICIT)  # no path meets so many
@@ -78,7 +86,7 @@ def main(
             work.told(share, word)
 
         work.told(0.0, "reading the scene")
-        made = world.build(read, level or read.render.level)
+        made = world.build(read, level or read.render.level, leap=leap, progress=work.told)
         for note in made.notes:
             work.progress.note(note)
         image.prepare()
@@ -104,6 +112,9 @@ def save(world: "World", picture: "Picture", seed: int, out: Path) -> None:
         "samples": [int(picture.samples.min()), int(picture.samples.max())],
         "seed": seed,
         "events": picture.events,
+        "leap": world.leap,
+        "leapt": picture.leapt,
+        "leaps": picture.leaps,
         "truncated": picture.truncated,
         "faults": picture.faults,
         "software": estimate.software(),

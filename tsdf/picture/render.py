@@ -22,6 +22,7 @@ from tsdf.errors import SceneError, UsageError
 from tsdf.handle import Handle
 from tsdf.picture.world import World, camera_of, sees
 from tsdf.scene.levels import LEVELS
+from tsdf.walk import packed
 from tsdf.walk import transport as T
 from tsdf.walk import walker as W
 from tsdf.walk.hybrid import ALL
@@ -57,6 +58,8 @@ class Picture:
         Paths given up because nothing let their light out, and rays that lost track of a surface.
     interrupted : bool
         Whether it is less than what was asked for because the user stopped it.
+    leapt, leaps : int
+        How many of the events were not drawn one by one, and how many leaps stand for them.
     """
 
     rgb: np.ndarray
@@ -68,6 +71,8 @@ class Picture:
     truncated: int
     faults: int
     interrupted: bool
+    leapt: int = 0
+    leaps: int = 0
 
     @property
     def relative_error(self) -> float:
@@ -87,20 +92,21 @@ class Walkers:
         Walkers under way, and what they were.
     radiance : (n, 3) float64
         Found so far by each sample; `reserve` makes room.
-    counters : (4,) int64
+    counters : (6,) int64
         See `walker.EVENTS`.
     """
 
     def __init__(self, world: World) -> None:
         near = T.WorldArrays(
             world.place.arrays, world.place.room, world.media, world.tables, world.lights, world.packed.arrays,
-            world.memory, world.absorption,
+            world.memory, world.leaps, world.absorption,
         )  # fmt: skip
         self.near = self.arrays = Handle(near)
         if 0 < world.media.singles < ALL:  # another level's law takes over, where it may have more or less room
             self.near = Handle(near._replace(media=world.media._replace(traits=LEVELS["explicit"].traits)))
             self.arrays = Handle(near._replace(geometry=world.brim.arrays))
         self.place, self.brim, self.packed = world.place, world.brim, world.packed
+        self.answered = world.media.traits.answered
         exemplars = len(self.packed.engines)
         self.walkers = [np.zeros(ROOM, W.WALKER) for _ in range(2)]
         self.amounts = [np.zeros((ROOM, world.amounts)) for _ in range(2)]
@@ -111,7 +117,7 @@ class Walkers:
         self.grain_hits = np.full((exemplars, ROOM), -1, np.int32)
         self.starts, self.ways = (np.zeros((ROOM, 3), np.float32) for _ in range(2))
         self.grain_starts, self.grain_ways = (np.zeros((exemplars, ROOM, 3), np.float32) for _ in range(2))
-        self.counters = np.zeros(4, np.int64)
+        self.counters = np.zeros(6, np.int64)
         self.asked = np.zeros(W.GRAINS_ASKED + exemplars, np.int64)
         self.radiance = np.zeros((0, 3))
         self.reserve(1)
@@ -161,6 +167,8 @@ class Walkers:
     def turn(self, live: int) -> int:
         """Take the first `live` of ``walkers[0]`` as far as they come without the ray engine, ask it, and return how
         many go on; ``walkers[1]`` then holds what they were, those that have ended as they ended."""
+        if self.answered:
+            packed.answer(self.arrays, self.batches[0], live)
         T.advance(self.near, self.arrays, self.near_batches[0], self.batches[0], live)
         live, rays = int(self.asked[W.LIVE]), int(self.asked[W.ASKED])
         if rays:
@@ -364,6 +372,8 @@ class Sums:
             rays=int(counters[W.RAYS]),
             seconds=seconds,
             truncated=int(counters[W.TRUNCATED]),
+            leapt=int(counters[W.LEAPT]),
+            leaps=int(counters[W.LEAPS]),
             faults=int(counters[W.FAULTS]),
             interrupted=interrupted,
         )

@@ -3,12 +3,12 @@
 Media become numbers in `media`; how light uses them is `transport`, pictures are `render`. The levels, cheapest first:
 isotropic (point scatterers, similarity), volume-hg (one Henyey-Greenstein lobe), volume (tabulated deflections),
 teleport (Algorithm 1 of Meng et al. 2015), teleport-joint (its offsets kept together), teleport-memory (where
-neighbours are as well), explicit (packed grains, traced).
+neighbours are as well), teleport-packed (packed grains, answered by records), explicit (packed grains, traced).
 """
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,11 +17,12 @@ from numpy.typing import ArrayLike
 from tsdf.data import format
 from tsdf.data.sampler import Tables, compile_tables
 from tsdf.data.table import Table
-from tsdf.errors import SceneError, TSDFError
+from tsdf.errors import SceneError, TSDFError, UsageError
 from tsdf.grain.grains import first_hit, load_grain
 from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.picture import image
+from tsdf.picture.leaping import GAMMA, checked, leaping
 from tsdf.picture.media import DARKEST, media_of, spectra_of
 from tsdf.scene.levels import LEVELS, Traits
 from tsdf.scene.medium import Component, VolumeParameters, free_path
@@ -42,12 +43,15 @@ from tsdf.vectors import frame
 from tsdf.walk.explicit import Packed, nothing_packed, packed
 from tsdf.walk.geometry import MESH, Place, Triangles, ball_hit, exact_hit, place
 from tsdf.walk.hybrid import hybrid_notes, singles_of
+from tsdf.walk.leaps import Leaps
 from tsdf.walk.lights import LightArrays, compile_lights
 from tsdf.walk.memory import Memory, memory_of
 from tsdf.walk.transport import Camera
 from tsdf.walk.walker import MAX_EVENTS, Absorption, Media
 
 CAPTIVES = 32  # paths that look for a way out from the camera
+OUTLIVED = 1000.0  # of the grains met in the mean, after which a path that leaps is given up: no light lives as long
+MOST_EVENTS = 1 << 60  # that a walker counts
 BOUNCES = 500  # after which there is none; a hole of a thousandth of all surfaces is found by then
 SLOW = 1e5  # grains met by a path, beyond which it is said how long that takes
 ENDLESS = 1e7  # beyond which a path takes seconds
@@ -63,13 +67,15 @@ class World:
     ----------
     scene : Scene
     level : str
+    leap : float
+        Radius of the smallest leap in transport mean free paths, 0 where no medium is deep enough.
     place : Place
         Geometry and its ray engine.
     brim : Place
         Where the chain goes on after the first grains if that is another place: media that it fills to the brim.
     packed : Packed
         Grains that are met one by one.
-    media, tables, memory, lights, absorption
+    media, tables, memory, leaps, lights, absorption
         Arrays for kernels.
     amounts : int
         How many amounts of matter a walker counts.
@@ -81,12 +87,14 @@ class World:
 
     scene: Scene
     level: str
+    leap: float
     place: Place
     brim: Place
     packed: Packed
     media: Media
     tables: Tables
     memory: Memory
+    leaps: Leaps
     lights: LightArrays
     absorption: Absorption
     amounts: int
@@ -205,7 +213,10 @@ def _triple(v: np.ndarray) -> tuple[float, float, float]:
     return float(v[0]), float(v[1]), float(v[2])
 
 
-def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
+def build(
+    scene: Scene, level: str, limit: int = MAX_EVENTS, leap: float | None = None,
+    progress: Callable[[float, str], None] | None = None,
+) -> World:  # fmt: skip
     """Return a scene ready to be rendered at a level.
 
     Parameters
@@ -213,7 +224,12 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
     scene : Scene
     level : str
     limit : int
-        Grains met after which a path is given up.
+        Grains met after which a path is given up; many more, if it is not given, where paths leap over most of them.
+    leap : float, optional
+        Radius of the smallest leap in transport mean free paths, 0 for none; else what the scene says, or `GAMMA`, where
+        the level leaps at all.
+    progress : callable, optional
+        Called with the share done and a word about it while records for leaps are made.
 
     Raises
     ------
@@ -223,6 +239,7 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
     if level not in LEVELS:
         raise SceneError(f"{scene.name}: no level {level!r}; levels are {', '.join(LEVELS)}")
     traits, singles = LEVELS[level].traits, singles_of(scene, level)
+    gamma = _gamma(scene, level, leap)
     read: dict[str, Table] = {}
 
     def table_of(spec: GrainSpec) -> Table:
@@ -246,7 +263,7 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
                     f"{scene.name}: {grain.table} has no {records.name}, which level {level} draws from; "
                     f"build it with {records.option}"
                 )
-    memory = _memory(scene, tables if traits.remembers else [])
+    memory = _memory(scene, tables if traits.remembers or traits.answered else [], traits.remembers)
     for number, (medium, boundary) in enumerate(zip(scene.media, made.boundaries, strict=True), 1):
         extent = _extent(medium, boundary.vertices if boundary is not None else None)
         if 2.0 * medium.radius > extent and medium.inside == "grains":
@@ -254,27 +271,37 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
                 f"{scene.name}: {called('medium', number, medium.name)}: a grain of diameter {2.0 * medium.radius:g} "
                 f"does not fit into the medium, which is {extent:.3g} thin"
             )
-    notes += _long_paths(scene, traits, tables, made, parameters, limit)
     lights, said = _lights(scene)
+    compiled = compile_tables(tables or [_no_table()], joint=traits.joint)
+    leaps, deep = leaping(scene, brim, media, compiled, memory, tables, gamma, bool(lights.sampled), progress)
+    met = _grains_met(scene, traits, tables, made, parameters, limit)
+    if any(deep) and limit == MAX_EVENTS:
+        longest = OUTLIVED * max(n for n, there in zip(met, deep, strict=True) if there)
+        media = media._replace(limit=int(min(max(limit, longest), MOST_EVENTS)))
+    notes += _long_paths(scene, [0.0 if there else n for n, there in zip(met, deep, strict=True)])
     notes += said
     if singles and scene.media and lights.sampled:
         notes.append(
-            f"{scene.name}: {'level explicit meets' if traits.packed else 'explicit grains meet'} suns and small "
+            f"{scene.name}: {f'level {level} meets' if traits.packed else 'explicit grains meet'} suns and small "
             "bright lights by chance alone: until many samples have, the picture is too dark and its variance does not "
             "tell; widen the sun or light by a smooth sky"
         )
     if singles and not traits.packed:
         notes += hybrid_notes(scene, tables)
-    grains = packed(scene, tables) if singles and scene.media else nothing_packed(len(scene.media), len(tables))
+    grains = nothing_packed(len(scene.media), len(tables))
+    if singles and scene.media:
+        grains = packed(scene, tables, traced=not traits.answered)
     return World(
         scene=scene,
         level=level,
+        leap=gamma if any(deep) else 0.0,
         place=made,
         brim=brim,
         packed=grains,
         media=media._replace(singles=singles),
-        tables=compile_tables(tables or [_no_table()], joint=traits.joint),
+        tables=compiled,
         memory=memory,
+        leaps=leaps,
         lights=lights,
         absorption=absorption,
         amounts=len(absorption.least),
@@ -283,18 +310,20 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
     )
 
 
-def _memory(scene: Scene, tables: list[Table]) -> Memory:
-    """Return what level teleport-memory remembers, of nothing where there are no tables."""
+def _memory(scene: Scene, tables: list[Table], chained: bool) -> Memory:
+    """Return what tables remember of entries and, where light goes from sphere to sphere in a chain, packings of their
+    neighbours; of nothing where there are no tables."""
     if not tables:
         return memory_of([], [], [], [])
     laws, grains, at = [], [], 0
     for number, medium in enumerate(scene.media, 1):
         own = tables[at : at + len(medium.grains)]
         at += len(own)
-        try:
-            laws.append(law(medium.packing_fraction))
-        except TSDFError as error:
-            raise SceneError(f"{scene.name}: {called('medium', number, medium.name)}: {error}") from None
+        if chained:
+            try:
+                laws.append(law(medium.packing_fraction))
+            except TSDFError as error:
+                raise SceneError(f"{scene.name}: {called('medium', number, medium.name)}: {error}") from None
         grains.append([(table, grain.fraction) for grain, table in zip(medium.grains, own, strict=True)])
     fractions = [medium.packing_fraction for medium in scene.media]
     return memory_of(laws, fractions, [medium.radius for medium in scene.media], grains)
@@ -337,11 +366,22 @@ def mean_chord(medium: MediumSpec, boundary: Triangles | None) -> float:
     return 4.0 / 3.0 * shape.radius
 
 
-def _long_paths(
+def _gamma(scene: Scene, level: str, leap: float | None) -> float:
+    """Return the smallest radius of leaps in transport mean free paths; UsageError where it cannot be what is asked."""
+    can = LEVELS[level].traits.leaps
+    if leap is None:
+        named = scene.render.leap
+        return (GAMMA if named is None else checked(named)) if can else 0.0
+    if checked(leap) and not can:
+        raise UsageError(f"{scene.name}: level {level} cannot leap, for its grains have their places; leave out leap")
+    return leap
+
+
+def _grains_met(
     scene: Scene, traits: Traits, tables: list[Table], place: Place, parameters: Sequence[VolumeParameters], limit: int
-) -> list[str]:
-    """Return what is to be said of media in which paths meet very many grains; SceneError where they hardly end."""
-    notes, at = [], 0
+) -> list[float]:
+    """Return how many grains a path meets in each medium in the mean, about, until absorption or the limit ends it."""
+    found, at = [], 0
     camera = np.array(scene.camera.position) - place.centre
     for m, (medium, volume) in enumerate(zip(scene.media, parameters, strict=True)):
         own = list(zip(medium.grains, tables[at : at + len(medium.grains)], strict=True))
@@ -357,7 +397,14 @@ def _long_paths(
             / max(table.albedo(), DARKEST)
             for grain, table in own
         )
-        events = min(events, 1.0 / max(1.0 - kept, DARKEST), limit)  # absorption ends paths
+        found.append(min(events, 1.0 / max(1.0 - kept, DARKEST), limit if limit != MAX_EVENTS else math.inf))
+    return found
+
+
+def _long_paths(scene: Scene, met: Sequence[float]) -> list[str]:
+    """Return what is to be said of media in which paths meet very many grains; SceneError where they hardly end."""
+    notes = []
+    for m, (medium, events) in enumerate(zip(scene.media, met, strict=True)):
         title = called("medium", m + 1, medium.name)
         where = f"{scene.name}: {title}: light meets about {events:.1g} grains in the mean"
         if not events <= ENDLESS:

@@ -74,6 +74,7 @@ class Render:
     level: str = "teleport"  # one of LEVELS
     spp: int = 64  # samples per pixel
     seed: int = 0
+    leap: float | None = None  # smallest leap [transport mean free paths], 0 for none; None where it is not said
     explicit_grains: int = 0  # met one by one, the first from the camera, before a chain of grains takes over
 
 
@@ -695,6 +696,22 @@ _SURFACE = _table(
     shape=_section(_tagged(rectangle=_RECTANGLE, mesh=_MESH, box=_BOX, sphere=_SPHERE)),
     reflectance=_colour(1.0),
 )
+
+
+def _leap(value: Any, key: str, at: _Place) -> float:
+    """Read the smallest radius of leaps: 0 for none, else 1 or more."""
+    leap: float = _number(0.0)(value, key, at)
+    if 0.0 < leap < 1.0:
+        at.fail(f"{key} must be 0 (none) or at least 1, not {leap:g}; leaps that short are biased")
+    return leap
+
+
+def _check_render(render: Render, at: _Place) -> Render:
+    if render.leap and not levels.LEVELS[render.level].traits.leaps:
+        at.fail(f"level {render.level} cannot leap, for its grains have their places; leave out leap, or say 0")
+    return render
+
+
 _CAMERA = _table(
     Camera,
     _check_camera,
@@ -714,9 +731,11 @@ _SCENE = _table(
     render=_section(
         _table(
             Render,
+            _check_render,
             level=_choice(LEVELS),
             spp=_integer(1, MAX_SAMPLES),
             seed=_integer(),
+            leap=_leap,
             explicit_grains=_integer(0, MAX_EXPLICIT),
         )
     ),

@@ -22,6 +22,7 @@ from tsdf.grain.meshes import read_mesh
 from tsdf.grain.optics import OFFSET, UNPOLARISED, P, S, fresnel, nearer, on_plane, parted, sound
 from tsdf.sampling import GOLDEN, key_of, mix, turn, unit
 from tsdf.scene.scene import GrainSpec, Scene, called
+from tsdf.spheres.around import Around, around_of
 from tsdf.spheres.packing import Cells, cells_of, next_sphere, pack
 from tsdf.vectors import KERNEL, dot, renewed, step, triple
 from tsdf.walk.geometry import planes_of
@@ -33,15 +34,17 @@ ENTERED, INSIDE, RETRIED, LEFT = 0, 1, 2, 4
 
 
 class Grains(NamedTuple):
-    """What kernels ask about packed grains. The first two are tuples over media, the rest arrays.
+    """What kernels ask about packed grains. The first three are tuples over media, the rest arrays.
 
-    cells, centres: the tile's grid and its (n, 3) centres [R]; radius (m,): R [unit]; seed (m,) uint64. Of components:
+    cells, centres, around: the tile's grid, its (n, 3) centres [R], and for grains that are not traced the spheres
+    around each; radius (m,): R [unit]; seed (m,) uint64. Of components:
     share (c,): running sum of number fractions in each medium; eta, kept_apart (c,) (the polarisations), exemplar (c,)
     int32: ray-engine scene. Of the exemplars' facets: planes (f, 4), centroids (f, 3), first_facet (e,).
     """
 
     cells: tuple[Cells, ...]
     centres: tuple[np.ndarray, ...]
+    around: tuple[Around, ...]
     radius: np.ndarray
     seed: np.ndarray
     share: np.ndarray
@@ -68,6 +71,13 @@ def centre_of(grains, m, i, j, k, sphere):
 
 
 @njit(**KERNEL)
+def named(grains, m, i, j, k, sphere):
+    """Return the key of the grain in a sphere of tile (i, j, k) of medium m, of which it is a function."""
+    tile = key_of(grains.seed[m], (i + 1048576) * 2097152 + (j + 1048576), k + 1048576)
+    return mix(tile + np.uint64(sphere))
+
+
+@njit(**KERNEL)
 def next_grain(grains, room, m, p, d, t_max):
     """Return distance to the next grain's bounding sphere along d from p [unit] or infinity, its centre and its key."""
     r = grains.radius[m]
@@ -79,8 +89,7 @@ def next_grain(grains, room, m, p, d, t_max):
             return math.inf, o, np.uint64(0)
         centre = centre_of(grains, m, i, j, k, sphere)
         if stands(room, m, centre):
-            tile = key_of(grains.seed[m], (i + 1048576) * 2097152 + (j + 1048576), k + 1048576)
-            return t * r, centre, mix(tile + np.uint64(sphere))
+            return t * r, centre, named(grains, m, i, j, k, sphere)
 
 
 @njit(**KERNEL)
@@ -217,6 +226,7 @@ def nothing_packed(media: int, components: int) -> Packed:
     arrays = Grains(
         cells=(cells,),  # one, whatever the number of media, which would be part of the type
         centres=(np.zeros((0, 3)),),
+        around=(around_of(None),),
         radius=np.ones(media),
         seed=np.zeros(media, np.uint64),
         share=np.ones(components),
@@ -281,8 +291,10 @@ def exemplar(spec: GrainSpec, table: Table, where: str, folder: str | None = Non
     return grain
 
 
-def packed(scene: Scene, tables: Sequence[Table]) -> Packed:
+def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed:
     """Pack the media of a scene with the grains of its tables, one table for each component of each medium in turn.
+
+    Grains that are not to be `traced` need not be found.
 
     Raises
     ------
@@ -291,8 +303,11 @@ def packed(scene: Scene, tables: Sequence[Table]) -> Packed:
     """
     titles = [f"{scene.name}: {called('medium', m, medium.name)}" for m, medium in enumerate(scene.media, 1)]
     own = [(spec, where) for medium, where in zip(scene.media, titles, strict=True) for spec in medium.grains]
-    grains = [exemplar(spec, table, where, scene.folder) for (spec, where), table in zip(own, tables, strict=True)]
-    cells, centres, notes = [], [], []
+    grains = [
+        exemplar(spec, table, where, scene.folder) if traced else None
+        for (spec, where), table in zip(own, tables, strict=True)
+    ]
+    cells, centres, around, notes = [], [], [], []
     share, eta, kept_apart, chosen = [], [], [], []
     engines: list[Any] = []
     known: dict[str, int] = {}
@@ -305,6 +320,7 @@ def packed(scene: Scene, tables: Sequence[Table]) -> Packed:
             raise SceneError(f"{where}: {error}") from None
         cells.append(cells_of(packing))
         centres.append(np.ascontiguousarray(packing.centres))
+        around.append(around_of(None if traced else packing))
         notes.append(f"{where}: {len(packing.centres)} spheres in a tile of {packing.side:.4g} R, "
                      f"packing fraction {packing.fraction:.6f}")  # fmt: skip
         fractions = np.array([grain.fraction for grain in medium.grains])
@@ -312,7 +328,7 @@ def packed(scene: Scene, tables: Sequence[Table]) -> Packed:
         for grain, table in zip(grains[at : at + len(fractions)], tables[at : at + len(fractions)], strict=True):
             eta.append(table.header["optics"]["eta"])
             kept_apart.append(table.header["optics"]["fresnel"] == "sp")
-            if grain.kind == "sphere":
+            if grain is None or grain.kind == "sphere":
                 chosen.append(EXACT_SPHERE)
                 continue
             if grain.mesh_hash not in known:
@@ -328,6 +344,7 @@ def packed(scene: Scene, tables: Sequence[Table]) -> Packed:
     arrays = Grains(
         cells=tuple(cells),
         centres=tuple(centres),
+        around=tuple(around),
         radius=np.array([medium.radius for medium in scene.media]),
         seed=np.array([medium.packing_seed for medium in scene.media], np.uint64),
         share=np.array(share),

@@ -34,6 +34,7 @@ from tsdf.walk import memory as M
 from tsdf.walk.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit
 from tsdf.walk.grid import GRAZING, march, plane_hit
 from tsdf.walk.hybrid import hand_over
+from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, Leaps, leap, missing, patience
 from tsdf.walk.lights import LightArrays
 from tsdf.walk.lights import draw as draw_light
 from tsdf.walk.lights import radiance as light_from
@@ -86,6 +87,7 @@ class WorldArrays(NamedTuple):
     lights: LightArrays
     grains: X.Grains
     memory: M.Memory
+    leaps: Leaps
     absorption: Absorption
 
 
@@ -273,10 +275,11 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
     p, d, key, free = triple(w.p), triple(w.d), w.key, w.free
     mean, reach, travel = media.free[m], media.reach[m], media.travel[m]
     first, last = media.first[m], media.first[m] + media.kinds[m] - 1
-    luck, pdf, steps, state = w.luck, w.pdf, 0, LOOK
-    patience = min(PATIENCE, media.limit - w.events)
+    luck, pdf, steps, leapt, state = w.luck, w.pdf, 0, 0, LOOK
+    most = min(PATIENCE, media.limit - w.events)
     bound, fresh = clearance(g, m, p), True
     convex, hair = alone(g, m), HAIR * g.slack[m]
+    again = NEVER if once else patience(world.leaps, m, missing(world.leaps, m, bound))
     while True:
         if free < 0.0:
             key += GOLDEN
@@ -286,7 +289,7 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
                 bound = clearance(g, m, p)
             if bound <= free and not (convex and bound > 0.0 and clearance(g, m, step(p, free, d)) > hair):
                 break
-        if steps >= patience or (not once and full(batch)):
+        if steps >= most or (not once and full(batch)):
             state = WAIT
             break
         fresh = False
@@ -297,6 +300,20 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
             amounts[travel] += free
             luck += absorption.least[travel] * free
         free = -1.0
+        if steps >= again:
+            write(w.p, p)
+            write(w.d, d)
+            w.key, w.luck, w.pdf = key, luck, pdf
+            wait, bound_there = leap(world, batch, w, amounts)
+            again = steps + wait
+            if wait <= LEAPT_ON:
+                leapt += 1
+                p, d, key, free, luck, pdf = triple(w.p), triple(w.d), w.key, w.free, w.luck, w.pdf
+                if wait == ENDS:
+                    state = ENDED
+                    break
+                bound, most = bound_there, min(most, steps + media.limit - w.events)
+                continue
 
         c = first
         if last > first:
@@ -347,8 +364,8 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
             luck = w.luck
         if once:
             break
-    batch.counters[EVENTS] += steps
-    w.events += steps
+    batch.counters[EVENTS] += steps - leapt
+    w.events += steps - leapt
     write(w.p, p)
     write(w.d, d)
     w.key, w.free, w.luck, w.pdf = key, free, luck, pdf
@@ -634,20 +651,23 @@ def pass_through(world, batch, w, amounts, t_b, t, thick):
 
 @njit(**KERNEL)
 def enter(world, w, s, centre, key):
-    """Bring a walker to a grain's bounding sphere at distance s and into the grain's frame."""
+    """Bring a walker to a grain's bounding sphere at distance s and, if the grain is traced, into its frame."""
     grains, media, m = world.grains, world.media, w.medium
     radius = grains.radius[m]
-    x = step(step(triple(w.p), s, triple(w.d)), -1.0, centre)
+    w.component = X.component_of(grains, media.first[m], media.kinds[m], key)
+    w.grain, w.mode, w.state, w.facet, w.pdf, w.ray = key, GRAIN, X.ENTERED, NONE, -1.0, NONE
+    write(w.q, centre)
+    x = step(triple(w.p), s, triple(w.d))
+    if media.traits.answered:
+        write(w.p, x)
+        return
+    x = step(x, -1.0, centre)
     x = (x[0] / radius, x[1] / radius, x[2] / radius)
     size = 1.0 / math.sqrt(dot(x, x))
     p = X.turned(key, (x[0] * size, x[1] * size, x[2] * size), True)
     write(w.p, p)
     write(w.e, p)
     write(w.d, X.turned(key, triple(w.d), True))
-    write(w.q, centre)
-    w.grain, w.mode, w.state, w.facet, w.pdf = key, GRAIN, X.ENTERED, NONE, -1.0
-    w.component = X.component_of(grains, media.first[m], media.kinds[m], key)
-    w.ray = NONE
 
 
 @njit(**KERNEL)
@@ -692,7 +712,12 @@ def in_grain(world, batch, w, amounts, facet):
 
 @njit(**KERNEL)
 def meet_grain(world, batch, w, amounts):
-    """Take a walker on in its grain, or ask the ray engine for the facet that it meets; return what becomes of it."""
+    """Take a walker on in its grain, or ask for the facet that it meets or the record; return what becomes of it."""
+    if world.media.traits.answered:  # by `packed`, between two turns, which may have taken it to its end
+        if w.state & X.LEFT == 0:
+            return WAIT
+        w.mode = FLY
+        return ENDED
     e = world.grains.exemplar[w.component]
     if e == X.EXACT_SPHERE:
         return in_grain(world, batch, w, amounts, NONE)

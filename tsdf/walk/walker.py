@@ -30,7 +30,7 @@ WALKER = np.dtype(
 FLY, JUMP, GRAIN = 0, 1, 2
 UNKNOWN = -2  # medium of a walker that may have crossed a boundary
 
-EVENTS, RAYS, TRUNCATED, FAULTS = range(4)  # counters
+EVENTS, RAYS, TRUNCATED, FAULTS, LEAPT, LEAPS = range(6)  # counters; LEAPT of the events, in so many LEAPS
 LIVE, MOST, ASKED, GRAINS_ASKED = range(4)  # of `Batch.asked`
 CLEAR, LOOK, WAIT, ENDED, HANDED = range(5)  # what becomes of a walker: it has met nothing, must look ahead, ...
 
@@ -86,7 +86,7 @@ class Batch(NamedTuple):
     that are born; starts and ways (n, 3) float32 the rays in the scene, grain_starts and grain_ways (e, n, 3) those in
     the exemplars, hits (n + 1, engines) and grain_hits (e, n) int32 the facets that they meet, the last of
     hits those of the walker under way. radiance (samples, 3);
-    counters (4,): see EVENTS; asked (3 + e,): walkers in out, the number of them from which on no more are made, rays
+    counters (6,): see EVENTS; asked (3 + e,): walkers in out, the number of them from which on no more are made, rays
     asked for in the scene, and in each exemplar.
     """
 
