@@ -72,7 +72,7 @@ class GrainSizes:
 
 
 @dataclass(frozen=True)
-class Packed:
+class InWords:
     """Packed grains in our words, radius and packing fraction, and in the others'.
 
     Attributes
@@ -185,7 +185,7 @@ def grain_sizes(grains: Sequence[tuple[Table, float]], material_density: float |
 
 def convert(
     grains: Sequence[tuple[Table, float]], said: Mapping[str, float], metres_per_unit: float | None = None
-) -> Packed:
+) -> InWords:
     """Return bounding radius and packing fraction of grains of which somebody says size and amount in any words.
 
     Parameters
@@ -216,7 +216,7 @@ def convert(
     if amount == "packing_fraction":
         if not fraction <= MAX_PACKING_FRACTION:
             raise UsageError(f"packing_fraction must be at most {MAX_PACKING_FRACTION:g}, not {fraction:g}")
-        return Packed(sizes, fraction, radius, metres_per_unit)
+        return InWords(sizes, fraction, radius, metres_per_unit)
     solid = fraction
     if amount == "density":
         solid = fraction / _known_density(sizes, amount)
@@ -229,7 +229,7 @@ def convert(
         raise UsageError(f"solid_fraction is a share of space, at most 1, not {solid:g}")
     if solid / sizes.solid_share > DENSEST_RANDOM:
         raise UsageError(_too_dense(grains, sizes, amount, fraction, solid / sizes.solid_share))
-    return Packed(sizes, solid / sizes.solid_share, radius, metres_per_unit)
+    return InWords(sizes, solid / sizes.solid_share, radius, metres_per_unit)
 
 
 def check_words(said: Mapping[str, float]) -> None:
@@ -286,7 +286,7 @@ def _too_dense(
 
     Mean free paths fall as 1/density: a void and a grain together are V / (A solid_fraction) long in the mean.
     """
-    most = Packed(sizes, DENSEST_RANDOM, 1.0)
+    most = InWords(sizes, DENSEST_RANDOM, 1.0)
     densest = most.solid_fraction if amount == "solid_fraction" else most.density
     path = volume_parameters([Component(table, share) for table, share in grains], DENSEST_RANDOM)
     longer = wanted / DENSEST_RANDOM
