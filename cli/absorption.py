@@ -71,14 +71,7 @@ def conventions(products: Sequence[float], radius: float | None, unit: float | N
     unit : float or None
         Length of the scene unit [m].
     """
+    by = {"R": 1.0} | ({} if radius is None else {"unit": 1.0 / radius})
+    by |= {} if radius is None or unit is None else {"m": 1.0 / (radius * unit)}
     different = products if len(set(products)) > 1 else products[:1]
-
-    def row(by: float) -> str:
-        return ", ".join(f"{x * by:.4g}" for x in different)
-
-    said = [f"{row(1.0)} / R"]
-    if radius is not None:
-        said.append(f"{row(1.0 / radius)} / unit")
-        if unit is not None:
-            said.append(f"{row(1.0 / (radius * unit))} / m")
-    return " = ".join(said)
+    return " = ".join(f"{', '.join(f'{x * factor:.4g}' for x in different)} / {name}" for name, factor in by.items())

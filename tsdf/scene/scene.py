@@ -666,7 +666,7 @@ def _in_numbers(medium: MediumSpec, metres_per_unit: float | None, at: _Place) -
         if medium.sizes:
             shares = [(table, grain.fraction) for table, grain in zip(tables, medium.grains, strict=True)]
             packed = convert(shares, dict(medium.sizes), metres_per_unit)
-            medium = replace(medium, radius=packed.radius, packing_fraction=packed.packing_fraction)
+            medium = replace(medium, radius=packed.radius, packing_fraction=packed.fraction)
         grains = []
         for grain, table, ask in zip(medium.grains, tables, coloured, strict=True):
             if ask:
