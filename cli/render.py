@@ -1,6 +1,8 @@
 """``tsdf-render``: a scene in, a picture out."""
 
 import json
+import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -137,6 +139,24 @@ def summary(world: "World", picture: "Picture", out: Path) -> None:
         f"{picture.relative_error:.2g}, {picture.seconds:.1f} s, {picture.events / max(picture.seconds, 1e-9):.3g} "
         "grain events per second"
     )
+    for line in media(world):
+        say(line)
     lost = picture.truncated + picture.faults
     if lost:
         click.echo(f"warning: {lost} paths were given up ({picture.faults} of them at a fault of a mesh)", err=True)
+
+
+def media(world: "World") -> Iterator[str]:
+    """What the media of a scene hold, in our words and in others', one line each, and the colours asked for."""
+    from tsdf.cli.absorption import conventions
+    from tsdf.scene.scene import called
+
+    for number, (medium, packed) in enumerate(zip(world.scene.media, world.sizes, strict=True), 1):
+        title = called("medium", number, medium.name)
+        yield f"{title}: {packed.summary()}"
+        for grain in medium.grains:
+            if colour := grain.absorption.colour:
+                by_radius = [a * medium.radius for a in grain.absorption.coefficient]
+                same = conventions(by_radius, medium.radius, world.scene.metres_per_unit)
+                deep = "deep" if math.isinf(grain.absorption.thickness) else f"{grain.absorption.thickness:g} thick"
+                yield f"{title}: colour {', '.join(f'{c:g}' for c in colour)} where {deep}: absorption {same}"

@@ -8,7 +8,7 @@ neighbours are as well), teleport-packed (packed grains, answered by records), e
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +38,7 @@ from tsdf.scene.scene import (
     SunLight,
     called,
 )
+from tsdf.scene.sizes import MATERIAL_DENSITY, InWords, grain_sizes
 from tsdf.spheres.packing_table import law
 from tsdf.vectors import frame
 from tsdf.walk.explicit import Packed, nothing_packed, packed
@@ -83,6 +84,8 @@ class World:
         Of the media, at the luminance-weighted mean of their absorption.
     notes : tuple of str
         What the user should know, one line each.
+    sizes : tuple of InWords
+        Of the media, in everybody's words.
     """
 
     scene: Scene
@@ -100,6 +103,7 @@ class World:
     amounts: int
     parameters: tuple[VolumeParameters, ...]
     notes: tuple[str, ...]
+    sizes: tuple[InWords, ...]
 
 
 def camera_of(world: World) -> Camera:
@@ -307,7 +311,18 @@ def build(
         amounts=len(absorption.least),
         parameters=parameters,
         notes=(*notes, *grains.notes),
+        sizes=tuple(_sizes(scene, tables)),
     )
+
+
+def _sizes(scene: Scene, tables: list[Table]) -> Iterator[InWords]:
+    """Return size and amount of the grains of each medium."""
+    at = 0
+    for medium in scene.media:
+        grains = [(table, grain.fraction) for grain, table in zip(medium.grains, tables[at:], strict=False)]
+        at += len(grains)
+        sizes = grain_sizes(grains, dict(medium.sizes).get(MATERIAL_DENSITY))
+        yield InWords(sizes, medium.packing_fraction, medium.radius, scene.metres_per_unit)
 
 
 def _memory(scene: Scene, tables: list[Table], chained: bool) -> Memory:
