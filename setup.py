@@ -1,4 +1,4 @@
-"""What pyproject.toml cannot say: the scripts that make reference data stay in the repository, beside what they make."""
+"""What pyproject.toml cannot say: the scripts that make reference data stay out of the wheel."""
 
 from setuptools import setup
 from setuptools.command.build_py import build_py
