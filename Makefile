@@ -64,6 +64,10 @@ check: .venv/installed  ## style and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+docs: .venv/installed  ## make the API reference, into reference/
+	$(BIN)/python docs/reference.py
+	@echo "open reference/index.html; docs/index.md lists all pages"
+
 bench: .venv/installed  ## measure speed and error side by side, into bench/
 	$(BIN)/python benchmarks/bench.py
 	$(BIN)/python benchmarks/bench_sampler.py
@@ -75,4 +79,4 @@ fuzz: .venv/installed  ## throw damaged and hostile files and signals at everyth
 	for name in $(FUZZERS); do \
 		$(BIN)/python fuzz/$$name.py $(if $(COUNT),--count $(COUNT)) --seed $(or $(SEED),0) || exit; done
 
-.PHONY: help install demo tables gallery pictures test check bench fuzz
+.PHONY: help install demo tables gallery pictures test check docs bench fuzz

@@ -1,7 +1,6 @@
 """The layout is what the design says: imports point one way, heavy third parties have one door each."""
 
 import ast
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -140,12 +139,3 @@ def test_help_loads_nothing_slow(command: str) -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
     assert "--help" in done.stdout and done.stdout.startswith(f"tsdf-{command} {tsdf.__version__}\n")
-
-
-def test_readme_points_to_what_is_there() -> None:
-    """Links of the README lead somewhere."""
-    readme = (ROOT / "README.md").read_text()
-    targets = re.findall(r"\]\(([^)#]+)\)", readme)
-    assert targets
-    for target in targets:
-        assert (ROOT / target).exists(), target
