@@ -6,24 +6,15 @@ radius R, angles in radians, absorption is the dimensionless product sigma_a R.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
+from tsdf.data.blocks import MEMORY_FIELDS, RECORD_FIELDS
 from tsdf.errors import UsageError
-
-FORMAT_VERSION = "1.1"  # the newest that this reads; see `version_for`
-CONDITIONALS = ("p_phi", "p_r", "p_z", "p_l")
-RECORD_FIELDS = ("r", "z", "phi_delta", "l", "entry_b2", "entry_azimuth")
-MEMORY_FIELDS = ("cos_theta", "entry_azimuth", "r", "z", "phi_delta", "l", "entry_b2")
-
-
-def version_for(blocks: Iterable[str]) -> str:
-    """Return the format version of a table with blocks of these names: the oldest that has them all."""
-    return "1.1" if any(name.startswith("memory_") for name in blocks) else "1.0"
 
 
 def frozen(value: Any) -> Any:
