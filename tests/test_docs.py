@@ -119,7 +119,7 @@ def test_blocks_are_of_known_languages(path: Path) -> None:
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_commands_parse(path: Path) -> None:
     """Each command of ours is taken by its own parser, without being run; others name targets and files there are."""
-    targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), flags=re.M)
+    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), flags=re.M)
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     for line in commands(path):
         program, *arguments = shlex.split(line, comments=True)
@@ -171,7 +171,22 @@ def test_links_lead_somewhere(path: Path) -> None:
         there = path.parent / file if file else path
         assert there.exists(), target
         headings = re.findall(r"^#+ (.*)$", there.read_text(), flags=re.M) if heading else []
-        assert not heading or heading in {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}, target
+        assert not heading or heading in {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}, (
+            target
+        )
+
+
+def test_the_recipes_name_what_is_there() -> None:
+    """Files and folders of CONTRIBUTING, and the names in capitals that it says stand in them."""
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    paths = {span for span in spans(ROOT / "CONTRIBUTING.md") if re.fullmatch(r"[\w./]+/[\w./]*", span)}
+    assert len(paths) > 20
+    for path in paths - {"reference/"}:
+        assert (ROOT / path).exists(), path
+    files = [ROOT / path for path in paths if path.endswith(".py")]
+    code = "".join(path.read_text() for path in files)
+    for name in re.findall(r"`(_?[A-Z]+|test_\w+)`", text):
+        assert re.search(rf"\b{name}\b", code), name
 
 
 def test_the_index_lists_all_pages() -> None:
