@@ -43,8 +43,28 @@ def plain(value: Any) -> str:
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
+def _say_version(context: click.Context, _: click.Parameter, value: bool) -> None:
+    if value and not context.resilient_parsing:
+        import tsdf
+
+        click.echo(f"{context.command.name} {tsdf.__version__}")
+        context.exit()
+
+
 class Tool(click.Command):
-    """A click command whose errors are one line, ``NAME: error: ...``; the callback may return an exit status."""
+    """A click command whose errors are one line, ``NAME: error: ...``; the callback may return an exit status.
+
+    Each has --version.
+    """
+
+    def __init__(self, *words: Any, **given: Any) -> None:
+        super().__init__(*words, **given)
+        self.params.append(
+            click.Option(
+                ["--version"], is_flag=True, is_eager=True, expose_value=False, callback=_say_version,
+                help="Show the version and exit.",
+            )
+        )  # fmt: skip
 
     def main(
         self, args: Sequence[str] | None = None, prog_name: str | None = None, *rest: Any, **extra: Any

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -171,13 +172,12 @@ def test_parts_and_merge(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_interrupt_says_what_is_safe(number: int, tmp_path: Path) -> None:
+def test_interrupt_says_what_is_safe(number: int, tmp_path: Path, launch: Callable[..., subprocess.Popen]) -> None:
     out = tmp_path / "i.tsdf.exr"
     command = [sys.executable, "-c", "from tsdf.cli.build import main; main()"]
     command += ["cube", "--eta", "1.31", "--paths", "1e9", "--threads", "1", "--quiet", "--out", str(out)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 60
-    while not Path(f"{out}.part").exists() and time.monotonic() < deadline:
+    process = launch(command, stderr=subprocess.PIPE, text=True)
+    while not Path(f"{out}.part").exists() and process.poll() is None:
         time.sleep(0.01)
     time.sleep(1.0)  # counts that are in no file yet
     process.send_signal(number)

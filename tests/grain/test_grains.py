@@ -433,9 +433,9 @@ def test_bodies_and_cavities():
 def test_many_bodies_are_fast():
     ball = mesh("octahedron")
     places = itertools.product(range(7), repeat=3)
-    begin = time.perf_counter()
+    begin = time.process_time()
     assert grain_from_mesh(*joined(*[moved(ball, 0.4, p) for p in places])).bodies == 343
-    assert time.perf_counter() - begin < 10
+    assert time.process_time() - begin < 10
 
 
 # ------------------------------------------------------------------------------------ what is refused
@@ -681,10 +681,10 @@ def test_crossing_check_is_fast_and_quiet():
         load_grain("hexprism", aspect=0.01),
         load_grain("snow", rounding=0),
     ):
-        begin = time.perf_counter()
+        begin = time.process_time()
         crossings = check_crossings(grain, seed=5)
         assert crossings.share == 0 and crossings.leaks < 1e-4
-        assert time.perf_counter() - begin < 5  # 0.4 s on a free machine
+        assert time.process_time() - begin < 5  # 0.4 s on a free machine
 
 
 def test_rays_are_checked():

@@ -50,7 +50,15 @@ class Report:
 
 
 def validate(path: str | os.PathLike[str], structure_only: bool = False) -> Report:
-    """Return what is wrong with a file; nothing is raised for a file that cannot be read."""
+    """Return what is wrong with a file; nothing is raised for a file that cannot be read.
+
+    Examples
+    --------
+    >>> import tsdf
+    >>> report = validate("cube.tsdf.exr")
+    >>> report.ok, report.findings
+    (True, ())
+    """
     name = os.fspath(path)
     findings = tuple(format.check(path))
     if any(finding.severity == "error" for finding in findings):

@@ -71,6 +71,12 @@ class Effort:
     ------
     UsageError
         If a value is out of range.
+
+    Examples
+    --------
+    >>> import tsdf
+    >>> tsdf.Effort(paths=1_000_000, joint=32, memory=64).cells is None  # 256 when it is built
+    True
     """
 
     paths: int | None = None

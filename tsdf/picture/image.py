@@ -88,6 +88,12 @@ def write_exr(
         If shapes are wrong or an attribute is not text.
     TSDFError
         If the file cannot be written.
+
+    Examples
+    --------
+    >>> write_exr("grey.exr", [[[0.5, 0.5, 0.5]]], attributes={"made_by": "me"})
+    >>> read_exr("grey.exr").attributes["made_by"]
+    'me'
     """
     import OpenEXR
 
@@ -124,6 +130,12 @@ def read_exr(path: str | os.PathLike[str]) -> Image:
     TSDFError
         If there is no such file, it is not an OpenEXR image of colour, or it is truncated. Not all damage can be
         seen: OpenEXR has no checksums.
+
+    Examples
+    --------
+    >>> image = read_exr("sky.exr")
+    >>> image.rgb.shape, image.variance is None
+    ((4, 8, 3), True)
     """
     return _read(path, math.inf)[0]
 

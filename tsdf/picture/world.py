@@ -10,6 +10,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import assert_never
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -470,6 +471,8 @@ def _lights(scene: Scene) -> tuple[LightArrays, list[str]]:
             environment *= light.scale
             rotation = light.rotation_deg
             notes += [f"{scene.name}: {note}" for note in said]
+        else:
+            assert_never(light)
     try:
         return compile_lights(constant, environment, rotation, suns), notes
     except TSDFError as error:

@@ -235,6 +235,13 @@ def load(path: str | os.PathLike[str]) -> Scene:
     ------
     SceneError
         In one line, for a file that cannot be read, is not TOML, or describes no scene.
+
+    Examples
+    --------
+    >>> import tsdf
+    >>> scene = tsdf.load_scene("heap.toml")
+    >>> scene.media[0].packing_fraction, scene.render.level
+    (0.5, 'teleport')
     """
     name = os.fspath(path)
     try:
@@ -274,6 +281,16 @@ def parse(data: Mapping[str, Any], folder: str | os.PathLike[str] = ".", name: s
     ------
     SceneError
         In one line, with the table, the key and the way out.
+
+    Examples
+    --------
+    >>> scene = parse({
+    ...     "camera": {"position": [0, -8, 1], "target": [0, 0, 1], "width": 160, "height": 120},
+    ...     "light": [{"type": "sun", "direction": [1, 0, 1], "irradiance": [3, 3, 3]}],
+    ...     "surface": [{"shape": {"type": "sphere", "centre": [0, 0, 1], "radius": 1}, "reflectance": 0.5}],
+    ... })
+    >>> scene.surfaces[0].shape
+    Sphere(centre=(0.0, 0.0, 1.0), radius=1.0)
     """
     return replace(_SCENE(data, "the scene", _Place(name, "", Path(folder))), name=name, folder=os.fspath(folder))
 
