@@ -11,7 +11,8 @@ from tsdf.errors import UsageError
 from tsdf.loaders.export import BETTER, ENOUGH
 from tsdf.picture import image
 from tsdf.scene.medium import Component, VolumeParameters, volume_parameters
-from tsdf.scene.scene import Absorption, absorption_at
+from tsdf.scene.scene import Absorption
+from tsdf.scene.specs import absorption_at
 from tsdf.walk.lights import LUMINANCE
 
 MOST_BOUNCES = 1024  # Cycles' own limit

@@ -119,7 +119,7 @@ def test_what_a_kernel_is_made_of(path: Path) -> None:
     assert imported(named(path)) == found
 
 
-LONG = {"tsdf/walk/transport.py", "tsdf/judge/analytic.py", "tsdf/scene/scene.py"}  # the kernels of light, the judge
+LONG = {"tsdf/walk/transport.py", "tsdf/judge/analytic.py"}  # the kernels of light, the judge
 
 
 def sources() -> list[Path]:

@@ -12,7 +12,8 @@ from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.scene import deep
-from tsdf.scene.scene import absorption_at, files_of, parse
+from tsdf.scene.scene import parse
+from tsdf.scene.specs import absorption_at, files_of
 
 
 @pytest.fixture(scope="module")
