@@ -31,7 +31,7 @@ from tsdf.sampling import GOLDEN, key_of, mix, unit
 from tsdf.vectors import KERNEL, cross, dot, frame, minus, renewed, step, triple
 from tsdf.walk import explicit as X
 from tsdf.walk import memory as M
-from tsdf.walk.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit
+from tsdf.walk.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit, unmet
 from tsdf.walk.grid import GRAZING, march, plane_hit
 from tsdf.walk.lights import LightArrays
 from tsdf.walk.lights import draw as draw_light
@@ -272,8 +272,8 @@ def wander(world, batch, w, amounts, once):
     mean, reach, travel = media.free[m], media.reach[m], media.travel[m]
     first, last = media.first[m], media.first[m] + media.kinds[m] - 1
     luck, pdf, steps, state = w.luck, w.pdf, 0, LOOK
-    patience = min(PATIENCE, media.limit - w.events)
-    bound, fresh = clearance(g, m, p), True
+    patience, spot = min(PATIENCE, media.limit - w.events), batch.hits.shape[0] - 1
+    bound, fresh = 0.0 if once else clearance(g, m, p), True
     convex, hair = alone(g, m), HAIR * g.slack[m]
     while True:
         if free < 0.0:
@@ -283,7 +283,10 @@ def wander(world, batch, w, amounts, once):
             if not fresh:
                 bound = clearance(g, m, p)
             if bound <= free and not (convex and bound > 0.0 and clearance(g, m, step(p, free, d)) > hair):
-                break
+                sure, known = unmet(g, batch.hits[spot], m, p, d, free)
+                if not sure:
+                    w.ray = spot if known else NONE
+                    break
         if steps >= patience or (not once and full(batch)):
             state = WAIT
             break
@@ -329,9 +332,13 @@ def wander(world, batch, w, amounts, once):
             if bound <= size and size > 0.0:
                 aim(w, offset, size, d, length, c)
                 end = step(p, size, triple(w.e))
-                if convex and bound > 0.0 and clearance(g, m, end) > hair:
+                sure, known = convex and bound > 0.0 and clearance(g, m, end) > hair, False
+                if not sure:
+                    sure, known = unmet(g, batch.hits[spot], m, p, triple(w.e), size)
+                if sure:
                     w.mode, p, bound = FLY, end, 0.0
                 else:
+                    w.ray = spot if known else NONE
                     once = True
             else:
                 p = step(p, scale, offset)
