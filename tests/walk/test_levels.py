@@ -126,6 +126,7 @@ def agree(a: Measured, b: Measured, sigmas: float = SIGMAS) -> bool:
 # ------------------------------------------------------------------------------- slabs of packed spheres
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fraction, thickness, truth, teleported, volume",
     [
@@ -200,6 +201,7 @@ def moments_of(table: Table, absorption: float) -> np.ndarray:
     return np.array(moments)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("albedo", [1.0, 0.99, 0.9])
 @pytest.mark.parametrize(
     "level, depth, mu",
@@ -446,6 +448,7 @@ def box_distance(points: np.ndarray, low: Sequence[float], high: Sequence[float]
     return -np.linalg.norm(np.maximum(q, 0.0), axis=1) - np.minimum(q.max(axis=1), 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["grains", "centres"])
 @pytest.mark.parametrize("buried", [False, True])
 @pytest.mark.parametrize("kind", ["slab", "box", "sphere", "mesh"])

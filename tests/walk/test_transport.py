@@ -274,6 +274,7 @@ def meshed(scene: Scene, folder: Path) -> Scene:
     return replace(scene, media=(replace(medium, shape=Mesh(folder / "as_mesh.ply")),))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", JUMPING)
 @pytest.mark.parametrize("boundary", ["exact", "mesh"])
 @pytest.mark.parametrize("name", LEAKS)
