@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from tsdf.cli.common import Tool, check_output, plain
+from tsdf.cli.common import Tool, check_output, plain, write_text
 
 TARGETS = ("pbrt", "blender", "openpbr", "materialx", "arnold", "karma", "csv", "npz")
 
@@ -96,10 +96,7 @@ def main(
     if out is None:
         click.echo(text, nl=False)
         return
-    from tsdf.files import replacing
-
-    with replacing(out) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(out, text)
 
 
 def _check_material(name: str) -> None:

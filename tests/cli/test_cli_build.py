@@ -92,8 +92,8 @@ def test_progress_and_summary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def test_progress_says_the_error_and_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it stands, the goal, and once, if it will take long, how long."""
-    from tsdf.make.estimate import TableError
     from tsdf.make.scatterometer import Progress
+    from tsdf.make.statistics import TableError
 
     class Recorder(common.Progress):
         def __call__(self, share: float, word: str) -> None:

@@ -83,6 +83,24 @@ def test_options(folder: Path) -> None:
     assert image.read_exr(folder / "O.EXR").rgb.shape == (4, 6, 3) and (folder / "O.png").is_file()
 
 
+def test_explicit_grains(folder: Path) -> None:
+    """Asked for by the command or the scene, and what was made says so; 0 is a picture without."""
+    assert run(folder, "--explicit-grains", 2, out="k.exr").exit_code == 0
+    assert facts(folder / "k.exr")["explicit_grains"] == 2
+    (folder / "asks.toml").write_text(SCENE.replace("[render]", "[render]\nexplicit_grains = 2"))
+    result = CliRunner().invoke(main, [str(folder / "asks.toml"), "--out", str(folder / "asks.exr")])
+    assert result.exit_code == 0 and "level teleport after 2 explicit grains" in result.stdout
+    asked, given = (image.read_exr(folder / name).rgb for name in ("asks.exr", "k.exr"))
+    assert np.array_equal(asked, given)
+    none = CliRunner().invoke(
+        main, [str(folder / "asks.toml"), "--out", str(folder / "none.exr"), "--explicit-grains", "0"]
+    )
+    assert none.exit_code == 0 and "explicit_grains" not in facts(folder / "none.exr")
+    run(folder, out="plain.exr")
+    assert np.array_equal(image.read_exr(folder / "none.exr").rgb, image.read_exr(folder / "plain.exr").rgb)
+    assert not np.array_equal(asked, image.read_exr(folder / "plain.exr").rgb)
+
+
 def test_stops(folder: Path) -> None:
     """By the clock, or once the error is small enough: then it is, and was not with a quarter of the samples."""
     begun = time.monotonic()
@@ -110,6 +128,10 @@ def test_stops(folder: Path) -> None:
         (["--seconds", "nan"], 2, "--seconds"),
         (["--target-error", "inf"], 2, "--target-error"),
         (["--spp", "1", "--seconds", "1"], 2, "give one"),
+        (["--explicit-grains", "-1"], 2, "--explicit-grains"),
+        (["--explicit-grains", "2.5"], 2, "--explicit-grains"),
+        (["--explicit-grains", "5", "--level", "volume"], 1, "explicit_grains = 5"),
+        (["--explicit-grains", "5", "--level", "explicit"], 1, "take teleport-memory"),
         (["--level", "teleprot"], 2, "--level"),
         (["--level", "teleport-memory"], 1, "--memory"),
         (["--out", "a.png"], 2, ".exr"),

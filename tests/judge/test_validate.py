@@ -16,8 +16,10 @@ from tsdf.data import format
 from tsdf.data.table import Table, thawed
 from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
-from tsdf.judge.validate import CODES, judge, reference, validate, zhou_curve
-from tsdf.make import estimate
+from tsdf.judge.court import CODES
+from tsdf.judge.physics import reference, zhou_curve
+from tsdf.judge.validate import judge, validate
+from tsdf.make import assemble
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.make.tally import Tally
 from tsdf.make.tracer import Tracer
@@ -37,7 +39,7 @@ def traced(
     shape = {key: getattr(grain, key) for key in ("kind", "name", "bounding_radius", "area", "volume", "convex")}
     shape |= {"parameters": {}, "bodies": grain.bodies, "faces": len(grain.faces), "mesh_sha256": None, "notes": []}
     made = {"command": "", "method": "traced", "seed": seed, "paths": paths, "max_bounces": 100_000}
-    return estimate.traced_table(tally, cells, shape, Optics(eta, fresnel), made, memory)
+    return assemble.traced_table(tally, cells, shape, Optics(eta, fresnel), made, memory)
 
 
 def errors(table: Table) -> set[str]:

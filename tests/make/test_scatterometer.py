@@ -20,9 +20,11 @@ from tsdf.errors import GrainError, TSDFError, UsageError
 from tsdf.grain.grains import Grain, load_grain
 from tsdf.grain.optics import Optics
 from tsdf.judge import analytic
-from tsdf.make import estimate, scatterometer
+from tsdf.make import assemble, scatterometer, statistics
 from tsdf.make import tally as T
-from tsdf.make.scatterometer import Build, Effort, chunks, merge
+from tsdf.make.origin import grain_header
+from tsdf.make.scatterometer import Build, Effort, merge
+from tsdf.make.spans import CHUNK_MIN, chunks
 from tsdf.make.tally import Tally
 
 
@@ -316,7 +318,7 @@ def test_chunks_cover_all_paths_once() -> None:
         limits = list(chunks(paths))
         assert limits[0][0] == 0 and limits[-1][1] == paths
         assert all(a[1] == b[0] for a, b in itertools.pairwise(limits))
-        assert all(b - a <= max(scatterometer.CHUNK_MIN, a // 8) for a, b in limits)
+        assert all(b - a <= max(CHUNK_MIN, a // 8) for a, b in limits)
 
 
 # ------------------------------------------------------------------------------------------ effort and errors
@@ -354,20 +356,20 @@ def test_target_takes_no_more_paths_and_cells_than_needed(octahedron: Grain) -> 
     build.run(octahedron, 2)
     error = build.error()
     assert error is not None and error.total_variation <= target
-    fewer = [n for n in estimate.candidate_cells() if n < error.cells]
-    assert all(estimate.table_error(build.tally, n).total_variation > target for n in fewer)
+    fewer = [n for n in statistics.candidate_cells() if n < error.cells]
+    assert all(statistics.table_error(build.tally, n).total_variation > target for n in fewer)
     before = max(first for first, _ in chunks(build.paths))
     shorter = Build.start(octahedron, Optics(1.31), Effort(paths=before))
     shorter.run(octahedron, 2)
-    assert estimate.TableErrors(shorter.tally).fewest(target) is None
+    assert statistics.TableErrors(shorter.tally).fewest(target) is None
 
 
 def test_a_target_costs_a_handful_of_judgements(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each of a few numbers of cells, on the way to where noise, falling as the root of the paths, lets it be met."""
     asked: list[int] = []
-    estimated = estimate.TableErrors._estimate
+    estimated = statistics.TableErrors._estimate
     monkeypatch.setattr(
-        estimate.TableErrors, "_estimate", lambda self, cells: asked.append(cells) or estimated(self, cells)
+        statistics.TableErrors, "_estimate", lambda self, cells: asked.append(cells) or estimated(self, cells)
     )
     grain = load_grain("cube")
     build = Build.start(grain, Optics(1.31), Effort(target_error=0.008))
@@ -544,12 +546,12 @@ def test_merging_cells_keeps_the_sums() -> None:
     rng = np.random.default_rng(0)
     tally.theta[:] = rng.integers(0, 100, tally.theta.shape)
     for cells in (8, 100, 256, 1024):
-        columns = estimate.columns_of(tally.theta, cells)
+        columns = statistics.columns_of(tally.theta, cells)
         assert columns.shape == (T.REPLICATES, cells + 2)
         assert np.array_equal(columns.sum(axis=1), tally.theta.sum(axis=1))
         assert np.array_equal(columns[:, 0], tally.theta[:, T.FINE + 1])
         assert np.array_equal(columns[:, -1], tally.theta[:, T.FINE])
-        edges = estimate.cos_theta_edges(cells)
+        edges = statistics.cos_theta_edges(cells)
         assert np.all(np.diff(edges[1:-1]) > 0)
 
 
@@ -595,9 +597,9 @@ def test_means_lie_in_their_cells(tmp_path: Path) -> None:
         cell = np.searchsorted(T.L_EDGES, length, side="right") - 1 if length else 0
         tally.cells[0, T.AT_L + min(cell, T.L - 1)] += energy
         tally.cells[0, T.AT_L_SUM + min(cell, T.L - 1)] += math.floor(energy * length + 0.5)
-    grain = scatterometer.grain_header(load_grain("cube"))
+    grain = grain_header(load_grain("cube"))
     made = {"method": "traced", "command": "", "seed": 0, "paths": 64, "max_bounces": 1}
-    table = estimate.traced_table(tally, 64, grain, Optics(1.31), made)
+    table = assemble.traced_table(tally, 64, grain, Optics(1.31), made)
     tsdf.write(table, tmp_path / "t.tsdf.exr")
     assert table.block("mean_l")[24, -2] == 1.4375 != round(5 * 1.45) / 5  # the upper edge of its cell
 

@@ -15,8 +15,8 @@ from tsdf.make import scatterometer
 from tsdf.make.scatterometer import Effort
 from tsdf.picture import image, render, world
 from tsdf.scene.scene import Box, Camera, EnvironmentLight, GrainSpec, MediumSpec, Mesh, Scene, Slab
-from tsdf.spheres.neighbours import law
 from tsdf.spheres.packing import cells_of, next_sphere, pack
+from tsdf.spheres.packing_table import law
 from tsdf.study.experiment import diffusion, slab
 from tsdf.walk import memory
 from tsdf.walk.memory import begin, memory_of, onward, remembered
