@@ -37,6 +37,7 @@ from tsdf.scene.scene import (
     Sphere,
     SunLight,
     SurfaceSpec,
+    absorption_at,
 )
 from tsdf.spheres.packing import pack
 from tsdf.walk import explicit
@@ -284,7 +285,7 @@ def test_spectra(ball: Table) -> None:
     together = of(ice, 20_000)
     expected, variance = np.zeros(3), together.error**2
     wavelengths, weights = image.spectral_weights()
-    spectrum = world.absorption_at(ice, wavelengths, 0.02)
+    spectrum = absorption_at(ice, wavelengths, 0.02)
     built = world.build(
         scene_of(Slab(-30.0, 0.0), 0.6, (GrainSpec(ball, absorption=Absorption("grey", (1.0,))),), WHITE), "teleport"
     )
