@@ -75,6 +75,7 @@ def main(
 
     from tsdf.data import format
     from tsdf.loaders import export
+    from tsdf.loaders.pointmedium import point_medium
     from tsdf.scene.scene import Absorption
 
     table = format.read(file)
@@ -85,8 +86,8 @@ def main(
         spec = Absorption("grey", (products[0] / radius,))
     else:
         spec = Absorption("rgb", tuple(x / radius for x in products))
-    medium = export.bulk(table, packing, radius, spec, unit)
-    measured = export.measure(medium, export.SLAB * radius) if measure else None
+    medium = point_medium(table, packing, radius, spec, unit)
+    measured = export.level_errors(medium, export.SLAB * radius) if measure else None
     request = export.Request(medium, lobes, kept, math.inf if thickness is None else thickness, measured)
     if to == "npz":
         assert out is not None
