@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from tsdf.cli.common import Tool, check_folder, check_numbers, named_levels, plain, say, shown_progress
+from tsdf.cli.common import Tool, check_folder, check_numbers, named_levels, plain, say, working
 from tsdf.cli.start import interrupt_status, interrupted, interruptible
 
 MEASURED = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume")
@@ -60,22 +60,15 @@ def main(
     read = format.read(table)
     meshes = [] if mesh is None else [mesh]
     check_folder(out, ["accuracy.md", "accuracy.csv", "accuracy.png"], table, *meshes)
-    begun = False
-
-    def meaning() -> str | None:
-        return None if begun else "nothing is written"
-
-    with shown_progress(quiet) as progress, interruptible(meaning):
+    with working(quiet) as work:
 
         def told(share: float, word: str) -> None:
-            nonlocal begun
             if interrupted():  # the exception was lost on its way, in a callback say
                 raise KeyboardInterrupt
-            begun = begun or share > 0.0
-            progress(share, word)
+            work.told(share, word)
 
         try:
-            with interruptible(meaning, raises=True):
+            with interruptible(work.meaning, raises=True):
                 found = accuracy.measure(
                     GrainSpec(read, mesh=mesh), packing, layer, chosen, packings, seconds, paths, seed, threads, told,
                     plain(table.name),

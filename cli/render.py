@@ -1,14 +1,13 @@
 """``tsdf-render``: a scene in, a picture out."""
 
 import json
-import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from tsdf.cli.common import LEVELS, Tool, check_numbers, check_output, plain, say, shown_progress
-from tsdf.cli.start import interrupt_status, interruptible
+from tsdf.cli.common import LEVELS, Tool, check_numbers, check_output, plain, say, working
+from tsdf.cli.start import interrupt_status
 
 if TYPE_CHECKING:
     from tsdf.picture.render import Picture
@@ -62,28 +61,19 @@ def main(
         spp = read.render.spp
     seed = read.render.seed if seed is None else seed
 
-    stop, begun = threading.Event(), False
-
-    def interrupted() -> str | None:
-        if not begun:
-            return "nothing is written"
-        stop.set()
-        return None
-
-    with shown_progress(quiet) as progress, interruptible(interrupted):
+    with working(quiet) as work:
 
         def told(share: float, word: str) -> None:
-            nonlocal begun
-            begun = True
-            progress(share, word)
+            work.begun = True  # samples that a picture can be made of
+            work.told(share, word)
 
-        progress(0.0, "reading the scene")
+        work.told(0.0, "reading the scene")
         made = world.build(read, level or read.render.level)
         for note in made.notes:
-            progress.note(note)
+            work.progress.note(note)
         image.prepare()
-        progress(0.0, "starting")
-        picture = render.render(made, spp, seconds, target_error, seed, threads, told, stop)
+        work.told(0.0, "starting")
+        picture = render.render(made, spp, seconds, target_error, seed, threads, told, work.stop)
         if not picture.samples.any():
             click.echo("interrupted before the first sample: nothing is written", err=True)
             return interrupt_status()

@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -211,17 +212,10 @@ def measure(
     stop: threading.Event | None = None,
 ) -> Picture:
     """Return the picture that any camera takes, as `render` does for the scene's own; of a parallel beam, say."""
-    if spp is None and seconds is None and target_error is None:
-        raise UsageError("say when to stop: samples per pixel, seconds or a target error")
-    for name, value in (("spp", spp), ("seconds", seconds), ("target error", target_error)):
-        if value is not None and not 0 < value < math.inf:
-            raise UsageError(f"{name} must be a finite number above 0, not {value}")
+    goal = Goal(spp, seconds, target_error)
     threads = threads or os.cpu_count() or 1
-    stop = stop or threading.Event()
-    halt = threading.Event()
-    count = width * height
-    total, squares = np.zeros((count, 3)), np.zeros((count, 3))
-    samples = np.zeros(count, np.int64)
+    stop, halt = stop or threading.Event(), threading.Event()
+    sums, count = Sums(width, height), width * height
     pool = [Walkers(world) for _ in range(threads)]
     pool[0].follow(T.Job(camera, 0, 1, 0, seed), 1, halt)  # compiles, outside the time
     for walkers in pool:
@@ -229,87 +223,182 @@ def measure(
     free = list(pool)
     begin = time.perf_counter()
 
-    def job(pixel: int, pixels: int, number: int, sample: int) -> np.ndarray:
+    def follow(block: Block) -> np.ndarray:
         mine = free.pop()
         try:
-            return mine.follow(T.Job(camera, pixel, number, sample, seed), pixels, halt)
+            return mine.follow(T.Job(camera, block.pixel, block.number, block.sample, seed), block.pixels, halt)
         finally:
             free.append(mine)
 
+    def spent() -> float:
+        return time.perf_counter() - begin
+
     def picture(interrupted: bool) -> Picture:
-        n = np.maximum(samples, 1)[:, None]
-        mean = total / n
-        with np.errstate(invalid="ignore", divide="ignore"):
-            variance = np.where(n > 1, np.maximum(squares / n - mean**2, 0.0) / np.maximum(n - 1, 1), math.inf)
-        counters = np.sum([walkers.counters for walkers in pool], axis=0)
-        shape = (height, width, 3)
-        return Picture(
-            mean.reshape(shape), variance.reshape(shape), samples.reshape(height, width), int(counters[W.EVENTS]),
-            int(counters[W.RAYS]), time.perf_counter() - begin, int(counters[W.TRUNCATED]), int(counters[W.FAULTS]),
-            interrupted,
-        )  # fmt: skip
-
-    def following(share: int, took: float) -> int:
-        """Return how many samples per pixel the next pass has, 0 for no next pass; the last one had `share`."""
-        most = max(FEW, PARTS * BLOCK // count)
-        if spp is not None:
-            return min(most if share else 1, spp - done)
-        if seconds is None:
-            return most if share else 1
-        if not share:
-            return 1
-        left = seconds - (time.perf_counter() - begin)
-        each = max(took, 1e-6) / share  # of a pass of one sample
-        return min(max(int(min(left, seconds / PARTS) / each), int(left >= each)), most, GROWTH * share)
-
-    def blocks(share: int) -> Iterator[tuple[int, int, int, int]]:
-        """First pixel, pixels, samples of each and the number of the first, one block of a pass after the other."""
-        size = min(max(share * count // PARTS, LEAST), BLOCK)
-        number = min(share, size)
-        step = max(1, size // number)
-        for sample in range(done, done + share, number):
-            for pixel in range(0, count, step):
-                yield pixel, min(step, count - pixel), min(number, done + share - sample), sample
+        return sums.picture(np.sum([walkers.counters for walkers in pool], axis=0), spent(), interrupted)
 
     done, share, took, reached = 0, 0, 0.0, math.inf
-    waiting: deque[tuple[tuple[int, int, int, int], Future]] = deque()
     with ThreadPoolExecutor(threads) as executor:
         try:
-            while not stop.is_set() and (share := following(share, took)) > 0:
-                coming, found, start = blocks(share), 0, time.perf_counter()
-                while not stop.is_set():
-                    while len(waiting) < 2 * threads and (block := next(coming, None)):
-                        waiting.append((block, executor.submit(job, *block)))
-                    if not waiting:
-                        break
-                    (pixel, pixels, number, _), future = waiting[0]
-                    try:
-                        radiance = future.result(timeout=0.1)
-                    except TimeoutError:
-                        continue
-                    waiting.popleft()
-                    total[pixel : pixel + pixels] += radiance.sum(axis=1)
-                    squares[pixel : pixel + pixels] += (radiance**2).sum(axis=1)
-                    samples[pixel : pixel + pixels] += number
-                    found += number * pixels
+            while not stop.is_set() and (share := goal.following(done, share, took, spent(), count)) > 0:
+                found, start = 0, time.perf_counter()
+                for block, radiance in _in_turn(executor, follow, _blocks(count, done, share), 2 * threads, stop):
+                    sums.add(block, radiance)
+                    found += block.number * block.pixels
                     if progress is not None:
-                        part = (done + found / count) / spp if spp else 0.0
-                        if seconds is not None:
-                            part = min(1.0, (time.perf_counter() - begin) / seconds)
-                        if target_error is not None and done > 1:
-                            part = min(1.0, (target_error / reached) ** 2)
-                        progress(part, f"{done + found // count} spp")
-                else:
+                        progress(goal.part(done, found / count, spent(), reached), f"{done + found // count} spp")
+                if stop.is_set():
                     break
                 took, done = time.perf_counter() - start, done + share
                 if target_error is not None and done > 1:
                     reached = max(picture(False).relative_error, 1e-9)
-                    if reached <= target_error:
-                        break
-                if target_error is not None and done >= BLACK and not total.any():
+                if goal.reached(done, reached, sums.black):
                     break
         except KeyboardInterrupt:
             stop.set()
         finally:
             halt.set()
     return picture(stop.is_set())
+
+
+# ------------------------------------------------------------------------------------- passes, and when to stop
+
+
+class Block(NamedTuple):
+    """Samples that one thread takes at once: first pixel, pixels, samples of each and the number of the first."""
+
+    pixel: int
+    pixels: int
+    number: int
+    sample: int
+
+
+def _blocks(count: int, done: int, share: int) -> Iterator[Block]:
+    """Yield the blocks of a pass of `share` samples over `count` pixels, each of which has `done` of them already."""
+    size = min(max(share * count // PARTS, LEAST), BLOCK)
+    number = min(share, size)
+    step = max(1, size // number)
+    for sample in range(done, done + share, number):
+        for pixel in range(0, count, step):
+            yield Block(pixel, min(step, count - pixel), min(number, done + share - sample), sample)
+
+
+def _in_turn(
+    executor: ThreadPoolExecutor,
+    follow: Callable[[Block], np.ndarray],
+    coming: Iterator[Block],
+    at_once: int,
+    stop: threading.Event,
+) -> Iterator[tuple[Block, np.ndarray]]:
+    """Yield blocks and what `follow` returns of each, in their order, until `stop` is set; so many are under way."""
+    waiting: deque[tuple[Block, Future]] = deque()
+    while not stop.is_set():
+        while len(waiting) < at_once and (block := next(coming, None)):
+            waiting.append((block, executor.submit(follow, block)))
+        if not waiting:
+            return
+        block, future = waiting[0]
+        try:
+            radiance = future.result(timeout=0.1)
+        except TimeoutError:
+            continue
+        waiting.popleft()
+        yield block, radiance
+
+
+class Sums:
+    """Sums over the samples of each pixel, and the picture that they make.
+
+    Attributes
+    ----------
+    total, squares : (h * w, 3) float64
+        Of radiance, and of its square.
+    samples : (h * w,) int64
+    """
+
+    def __init__(self, width: int, height: int) -> None:
+        self.shape = (height, width, 3)
+        self.total, self.squares = np.zeros((width * height, 3)), np.zeros((width * height, 3))
+        self.samples = np.zeros(width * height, np.int64)
+
+    @property
+    def black(self) -> bool:
+        """Whether no sample has found light yet."""
+        return not self.total.any()
+
+    def add(self, block: Block, radiance: np.ndarray) -> None:
+        """Add the radiance (pixels, number, 3) of a block."""
+        own = slice(block.pixel, block.pixel + block.pixels)
+        self.total[own] += radiance.sum(axis=1)
+        self.squares[own] += (radiance**2).sum(axis=1)
+        self.samples[own] += block.number
+
+    def picture(self, counters: np.ndarray, seconds: float, interrupted: bool) -> Picture:
+        """Return the picture so far; counters (4,) as in `Walkers`, seconds [s] that it took."""
+        n = np.maximum(self.samples, 1)[:, None]
+        mean = self.total / n
+        with np.errstate(invalid="ignore", divide="ignore"):
+            variance = np.where(n > 1, np.maximum(self.squares / n - mean**2, 0.0) / np.maximum(n - 1, 1), math.inf)
+        return Picture(
+            rgb=mean.reshape(self.shape),
+            variance=variance.reshape(self.shape),
+            samples=self.samples.reshape(self.shape[:2]),
+            events=int(counters[W.EVENTS]),
+            rays=int(counters[W.RAYS]),
+            seconds=seconds,
+            truncated=int(counters[W.TRUNCATED]),
+            faults=int(counters[W.FAULTS]),
+            interrupted=interrupted,
+        )
+
+
+@dataclass(frozen=True)
+class Goal:
+    """When a picture is done: at so many samples per pixel, after so many seconds, or at a relative error.
+
+    Raises
+    ------
+    UsageError
+        If none of them is given, or one is out of range.
+    """
+
+    spp: int | None
+    seconds: float | None
+    target_error: float | None
+
+    def __post_init__(self) -> None:
+        limits = (("spp", self.spp), ("seconds", self.seconds), ("target error", self.target_error))
+        if all(value is None for _, value in limits):
+            raise UsageError("say when to stop: samples per pixel, seconds or a target error")
+        for name, value in limits:
+            if value is not None and not 0 < value < math.inf:
+                raise UsageError(f"{name} must be a finite number above 0, not {value}")
+
+    def following(self, done: int, share: int, took: float, spent: float, count: int) -> int:
+        """Return how many samples per pixel the next pass has, 0 for no next pass.
+
+        Each of `count` pixels has `done` of them after `spent` seconds; the last pass had `share` and `took` seconds.
+        """
+        most = max(FEW, PARTS * BLOCK // count)
+        if self.spp is not None:
+            return min(most if share else 1, self.spp - done)
+        if self.seconds is None:
+            return most if share else 1
+        if not share:
+            return 1
+        left = self.seconds - spent
+        each = max(took, 1e-6) / share  # of a pass of one sample
+        return min(max(int(min(left, self.seconds / PARTS) / each), int(left >= each)), most, GROWTH * share)
+
+    def part(self, done: int, found: float, spent: float, error: float) -> float:
+        """Return the share done in [0, 1], with `found` samples per pixel of a pass after `done`, at this error."""
+        if self.target_error is not None and done > 1:
+            return min(1.0, (self.target_error / error) ** 2)
+        if self.seconds is not None:
+            return min(1.0, spent / self.seconds)
+        return (done + found) / self.spp if self.spp else 0.0
+
+    def reached(self, done: int, error: float, black: bool) -> bool:
+        """Return whether an error is small enough after `done` samples per pixel, or never will be."""
+        if self.target_error is None:
+            return False
+        return (done > 1 and error <= self.target_error) or (done >= BLACK and black)

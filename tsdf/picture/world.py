@@ -1,9 +1,9 @@
 """A scene at one level of detail, as the arrays that `transport` follows light through.
 
-Here free paths, phase functions and absorption spectra become numbers per medium and component; how light uses them is
-`transport`, pictures are `render`. The levels, cheapest first: isotropic (point scatterers, similarity), volume-hg (one
-Henyey-Greenstein lobe), volume (tabulated deflections), teleport (Algorithm 1 of Meng et al. 2015), teleport-joint (its
-offsets kept together), teleport-memory (where neighbours are as well), explicit (packed grains, traced).
+Media become numbers in `media`; how light uses them is `transport`, pictures are `render`. The levels, cheapest first:
+isotropic (point scatterers, similarity), volume-hg (one Henyey-Greenstein lobe), volume (tabulated deflections),
+teleport (Algorithm 1 of Meng et al. 2015), teleport-joint (its offsets kept together), teleport-memory (where
+neighbours are as well), explicit (packed grains, traced).
 """
 
 import math
@@ -22,9 +22,9 @@ from tsdf.grain.grains import first_hit, load_grain
 from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.picture import image
+from tsdf.picture.media import DARKEST, media_of, spectra_of
 from tsdf.scene.levels import LEVELS, Traits
-from tsdf.scene.medium import Component, VolumeParameters, free_path, volume_parameters
-from tsdf.scene.scene import Absorption as AbsorptionSpec
+from tsdf.scene.medium import Component, VolumeParameters, free_path
 from tsdf.scene.scene import (
     Box,
     ConstantLight,
@@ -35,14 +35,13 @@ from tsdf.scene.scene import (
     Scene,
     Slab,
     SunLight,
-    absorption_at,
     called,
 )
 from tsdf.spheres.neighbours import law
 from tsdf.vectors import frame
 from tsdf.walk.explicit import Packed, nothing_packed, packed
 from tsdf.walk.geometry import MESH, Place, Triangles, ball_hit, exact_hit, place
-from tsdf.walk.lights import LUMINANCE, LightArrays, compile_lights
+from tsdf.walk.lights import LightArrays, compile_lights
 from tsdf.walk.memory import Memory, memory_of
 from tsdf.walk.transport import Camera
 from tsdf.walk.walker import MAX_EVENTS, Absorption, Media
@@ -52,10 +51,7 @@ BOUNCES = 500  # after which there is none; a hole of a thousandth of all surfac
 SLOW = 1e5  # grains met by a path, beyond which it is said how long that takes
 ENDLESS = 1e7  # beyond which a path takes seconds
 EVENTS_PER_SECOND = 1e7  # of one thread, about
-DARKEST = 1e-300  # albedo, so that it has a logarithm
-FARTHEST = 1e300  # free path where nothing deflects, finite so that 0 of it is 0
 LOOKS = 200  # pixels along each side through which it is looked whether the camera sees anything
-LONGEST_OFFSET = math.sqrt(8.0)  # [R] r and z drawn independently: at most 2 each
 
 
 @dataclass(eq=False)
@@ -236,7 +232,7 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
     tables = [table_of(grain) for medium in scene.media for grain in medium.grains]
     made = place(scene, grains=traits.placed)
     notes = list(made.notes)
-    media, absorption, parameters = _media(scene, traits, tables, limit)
+    media, absorption, parameters = media_of(scene, traits, tables, limit)
     if records := LEVELS[level].records:
         for grain, table in zip((g for m in scene.media for g in m.grains), tables, strict=True):
             if not getattr(table, records.block):
@@ -347,7 +343,8 @@ def _long_paths(
         inside = bool(place.inside(m, camera[None])[0])
         events = grains_met(medium, place.boundaries[m], inside, extinction, volume.transport_mean_free_path)
         kept = max(
-            table.albedo(_least(grain.absorption, scene.metres_per_unit) * medium.radius) / max(table.albedo(), DARKEST)
+            table.albedo(spectra_of(grain.absorption, scene.metres_per_unit).least * medium.radius)
+            / max(table.albedo(), DARKEST)
             for grain, table in own
         )
         events = min(events, 1.0 / max(1.0 - kept, DARKEST), limit)  # absorption ends paths
@@ -405,103 +402,3 @@ def _lights(scene: Scene) -> tuple[LightArrays, list[str]]:
         return compile_lights(constant, environment, rotation, suns), notes
     except TSDFError as error:
         raise SceneError(f"{scene.name}: {error}") from None
-
-
-def _least(spec: AbsorptionSpec, metres_per_unit: float | None) -> float:
-    """Return the least absorption coefficient of any wavelength or channel [1/unit]."""
-    by_wavelength, by_channel = _spectra(spec, metres_per_unit)
-    return float(by_channel.min() if by_wavelength is None else by_wavelength.min())
-
-
-def _spectra(spec: AbsorptionSpec, metres_per_unit: float | None) -> tuple[np.ndarray | None, np.ndarray]:
-    """Return the absorption coefficient by wavelength (k,) or None, and by channel (3,), zero where by wavelength."""
-    if spec.kind == "grey":
-        return None, np.full(3, spec.coefficient[0])
-    if spec.kind == "rgb":
-        return None, np.array(spec.coefficient)
-    return absorption_at(spec, image.spectral_weights().wavelength_nm, metres_per_unit), np.zeros(3)
-
-
-def _media(
-    scene: Scene, traits: Traits, tables: list[Table], limit: int
-) -> tuple[Media, Absorption, tuple[VolumeParameters, ...]]:
-    """Return media, absorption and volume parameters, with amounts only for what absorbs."""
-    specs = [(medium, grain) for medium in scene.media for grain in medium.grains]
-    spectra = [_spectra(grain.absorption, scene.metres_per_unit) for _, grain in specs]
-    coloured = any(by_wavelength is not None for by_wavelength, _ in spectra)
-    weight = image.spectral_weights().weight if coloured else np.zeros((0, 3))
-    absorbs = [by_channel.any() or (s is not None and s.any()) for s, by_channel in spectra]
-
-    free, reach, first, kinds, travel, parameters = [], [], [], [], [], []
-    choice, scale, slots, g = [], [], [], []
-    columns: list[tuple[np.ndarray, np.ndarray]] = []  # exponents by wavelength and by channel of each amount
-
-    def amount(by_wavelength: np.ndarray | None, by_channel: np.ndarray) -> int:
-        columns.append((np.zeros(len(weight)) if by_wavelength is None else by_wavelength, by_channel))
-        return len(columns) - 1
-
-    at = 0
-    for medium in scene.media:
-        these = range(at, at + len(medium.grains))
-        components = [Component(tables[i], specs[i][1].fraction, medium.radius) for i in these]
-        grey = [
-            float(np.array(LUMINANCE) @ (by_channel if s is None else weight.T @ s))
-            for s, by_channel in (spectra[i] for i in these)
-        ]
-        path = free_path(components, medium.packing_fraction)
-        volume = volume_parameters(components, medium.packing_fraction, grey)
-        parameters.append(volume)
-        first.append(at)
-        kinds.append(len(components))
-        choice += list(np.cumsum(path.choice))
-        mean_cosine = volume.g if volume.albedo > 0.0 else 0.0  # where no light leaves a grain any will do
-        g += [mean_cosine] * len(components)
-        if traits.similar:
-            free.append(1.0 / max(volume.sigma_t * (1.0 - mean_cosine), 1.0 / FARTHEST))
-        else:
-            free.append(path.lambda_beta if traits.spheres else 1.0 / volume.sigma_t)
-        reach.append(LONGEST_OFFSET * medium.radius if traits.jumps else 0.0)
-        flown_wavelength, flown_channel = np.zeros(len(weight)), np.zeros(3)
-        for i, probability in zip(these, path.choice, strict=True):
-            scale.append(1.0 if traits.points else medium.radius)
-            if not absorbs[i]:
-                slots.append(-1)
-                continue
-            by_wavelength, by_channel = spectra[i]
-            if traits.points:
-                lossless = tables[i].albedo()
-                spectrum = np.zeros(0) if by_wavelength is None else by_wavelength
-                kept = [
-                    np.array([max(tables[i].albedo(s * medium.radius) / lossless, DARKEST) for s in values])
-                    for values in (spectrum, by_channel)
-                ]
-                slots.append(amount(np.log(kept[0]) if by_wavelength is not None else None, np.log(kept[1])))
-                if by_wavelength is not None:
-                    flown_wavelength -= probability * volume.sigma_t * mean_cosine * (1.0 - kept[0])
-                flown_channel -= probability * volume.sigma_t * mean_cosine * (1.0 - kept[1])
-            else:
-                slots.append(amount(None if by_wavelength is None else -by_wavelength, -by_channel))
-        absorbing = any(absorbs[i] for i in these)
-        travel.append(amount(flown_wavelength, flown_channel) if traits.similar and absorbing else -1)
-        at += len(components)
-    spectral = np.array([c[0] for c in columns]).T.reshape(len(weight), len(columns))
-    rgb = np.array([c[1] for c in columns]).T.reshape(3, len(columns))
-    least = rgb.max(axis=0) + (spectral.max(axis=0) if len(weight) else 0.0)
-    media = Media(
-        traits=traits,
-        free=np.array(free),
-        reach=np.array(reach),
-        first=np.array(first, np.int64),
-        kinds=np.array(kinds, np.int64),
-        travel=np.array(travel, np.int64),
-        choice=np.array(choice),
-        scale=np.array(scale),
-        slot=np.array(slots, np.int64),
-        g=np.array(g),
-        limit=limit,
-    )
-    absorption = Absorption(
-        spectral=np.ascontiguousarray(spectral), rgb=np.ascontiguousarray(rgb), weight=np.ascontiguousarray(weight),
-        least=np.ascontiguousarray(least),
-    )  # fmt: skip
-    return media, absorption, tuple(parameters)

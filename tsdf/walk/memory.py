@@ -194,7 +194,7 @@ def connect(world, batch, w, amounts, p, c, share, bound):
 
 
 @njit(**KERNEL)
-def roam(world, batch, w, amounts, once):
+def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of a walker, in one loop
     """Take a walker in a known medium from sphere to sphere while its flights can meet nothing else; as
     `transport.wander`, but that a shadow ends at the first grain it meets. Returns LOOK, WAIT or ENDED."""
     g, room, media, memory, tables = world.geometry, world.room, world.media, world.memory, world.tables

@@ -260,7 +260,7 @@ def alone(g, m):
 
 
 @njit(**KERNEL)
-def wander(world, batch, w, amounts, once):
+def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become of a walker, in one loop
     """Take a walker that is in a known medium from event to event while nothing else can be met.
 
     With `once` it is known that the walker reaches the end of its free path: one event. A flight that may meet
