@@ -6,7 +6,6 @@ which no finite number of moments can hold: it is kept apart, or cut off as delt
 """
 
 import io
-import math
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
@@ -135,8 +134,3 @@ def far_field(albedo: ArrayLike, g: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     w = np.asarray(albedo, np.float64)
     scattered = w * np.where(w > 0.0, np.asarray(g, np.float64), 0.0)
     return 0.5 * (1.0 + w), (1.0 + scattered) / (1.0 + w)
-
-
-def projected_area(table: Table) -> float:
-    """Return the mean projected area of the grain [R^2]."""
-    return math.pi * float(table.statistics["hit_probability"])

@@ -19,7 +19,8 @@ import numpy as np
 from tsdf.compiled import njit
 from tsdf.data.table import Table
 from tsdf.errors import UsageError
-from tsdf.picture.world import DARKEST, World, beam, build
+from tsdf.picture.media import DARKEST
+from tsdf.picture.world import World, beam, build
 from tsdf.sampling import mix, unit
 from tsdf.scene.levels import LEVELS
 from tsdf.scene.medium import Component, FreePath, free_path, volume_parameters
@@ -112,7 +113,7 @@ class Albedo:
     between : what the polynomial in n may miss of the reflectance, by two streams.
     two_streams, asymptotic : Streams
         The same slab by the theories.
-    profile, profile_error : (depths, w) absorbed in each layer
+    profile, profile_error : (depths, w) absorbed in each layer; in a grain it counts where light leaves it
     edges : (depths + 1,) float64 depths of the layers' ends [R]
     paths : int
         In each set.
@@ -135,11 +136,6 @@ class Albedo:
     paths: int
     eta: np.ndarray
     seconds: float
-
-    @property
-    def absorptance(self) -> np.ndarray:
-        """Share that the grains absorb, of a slab on black ground."""
-        return 1.0 - self.reflectance - self.transmittance
 
 
 def extinction(table: Table, packing_fraction: float, albedo: np.ndarray) -> np.ndarray:
@@ -236,6 +232,7 @@ class Paths:
     exponents: np.ndarray  # (amounts, w): logarithm of what an amount of matter leaves
     stretch: np.ndarray  # (2, w): that of a grain met, and of a length flown, where free paths depend on absorption
     edges: np.ndarray
+    finite: bool
     number: int
     light: np.ndarray
     layers: np.ndarray
@@ -289,7 +286,8 @@ class Paths:
         bottom = request.thickness if math.isfinite(request.thickness) else request.profile_depth
         return cls(
             replace(world, absorption=absorption, amounts=len(rows), media=media._replace(limit=1 if depths else LONG)),
-            cosine, exponents, stretch, np.linspace(0.0, bottom, depths + 1), number, np.zeros((GROUPS, 2, len(x))),
+            cosine, exponents, stretch, np.linspace(0.0, bottom, depths + 1),
+            math.isfinite(request.thickness), number, np.zeros((GROUPS, 2, len(x))),
             np.zeros((GROUPS, depths, BINS)), np.zeros(GROUPS, np.int64),
         )  # fmt: skip
 
@@ -323,6 +321,8 @@ class Paths:
             able = able & _thin(those, able, met[number])
             if profiled:
                 layer = np.searchsorted(self.edges, np.maximum(top - those["p"][:, 2], 0.0), side="right") - 1
+                if self.finite:  # what leaves below is beyond the last
+                    layer = np.minimum(layer, len(self.edges) - 2)
                 _deposit(layers, group[number], layer, before[number], crossed[:, 0], weight[number], LENGTHS)
                 before[number], weight[number] = crossed[:, 0], those["weight"]
             end = ~able & (those["weight"] > 0.0)
@@ -434,6 +434,11 @@ def measure(
         if request.ground > 0.0 and math.isfinite(request.thickness):
             whole = streams.over_ground(light, diffuse, request.ground)
             profile = layers[0] + request.ground * whole.transmittance * layers[-1][::-1]
+        if len(profile) and math.isfinite(
+            request.thickness
+        ):  # where free paths depend on absorption, layers do not know
+            kept = whole.reflectance + (1.0 - request.ground) * whole.transmittance
+            profile = profile * ((1.0 - kept) / np.maximum(profile.sum(axis=0), 1e-300))
         return np.array(whole), profile
 
     threads = threads or os.cpu_count() or 1
@@ -496,3 +501,23 @@ def _theories(
         lambda mu: streams.asymptotic(request.thickness * (full @ empty), x * (full @ length), full @ lossless, mu)
     )
     return theory, between, simple
+
+
+def records_of(level: str) -> str | None:
+    """Return the block of records that a level draws from, None where it needs none."""
+    records = LEVELS[level].records
+    return None if records is None else records.block
+
+
+def columns(result: Albedo, found: Spectrum) -> dict[str, np.ndarray]:
+    """Return what a slab does as named columns; layers of the profile by number, from above."""
+    sheet = {
+        "wavelength_nm": found.constants.wavelength_nm,
+        "reflectance": result.reflectance, "reflectance_error": result.reflectance_error, "between": result.between,
+        "transmittance": result.transmittance, "transmittance_error": result.transmittance_error,
+        "two_streams_r": result.two_streams.reflectance, "two_streams_t": result.two_streams.transmittance,
+        "asymptotic_r": result.asymptotic.reflectance, "asymptotic_t": result.asymptotic.transmittance,
+    }  # fmt: skip
+    for number, (layer, error) in enumerate(zip(result.profile, result.profile_error, strict=True), 1):
+        sheet[f"absorbed_{number}"], sheet[f"absorbed_{number}_error"] = layer, error
+    return sheet

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tsdf.data.phase import far_field, legendre, projected_area
+from tsdf.data.phase import far_field, legendre
 from tsdf.data.table import Table
 from tsdf.errors import UsageError
 from tsdf.grain.grains import Grain
@@ -246,9 +246,9 @@ def absorbed(table: Table, x: np.ndarray) -> np.ndarray:
     filled = share > 0.0
     share, length, middle = share[filled], length[filled], middle[filled]
     errors = table.header["standard_errors"]
-    mean_l, mean_c = share @ length, share @ middle
-    spread_l = math.sqrt(max(share @ length**2 - mean_l**2, 1e-300))
-    spread_c = math.sqrt(max(share @ middle**2 - mean_c**2, 1e-300))
+    mean_l, mean_c = float(share @ length), float(share @ middle)
+    spread_l = math.sqrt(max(float(share @ length**2) - mean_l**2, 1e-300))
+    spread_c = math.sqrt(max(float(share @ middle**2) - mean_c**2, 1e-300))
     lossless = min(max(float(table.statistics["mean_cosine"]), -1.0), 1.0)
     found = np.zeros((4, len(x)))
     with np.errstate(under="ignore"):
@@ -256,11 +256,11 @@ def absorbed(table: Table, x: np.ndarray) -> np.ndarray:
             if math.isnan(a):
                 found[:, i] = math.nan
                 continue
-            left = share * np.exp(-a * length)
+            left: np.ndarray = share * np.exp(-a * length)
             albedo = float(left.sum())
             cosine = left @ middle / albedo if albedo > 0.0 else math.nan
             again = left**2 / share
-            spread = math.sqrt(max(float(again.sum() - albedo**2), 0.0))
+            spread = math.sqrt(max(float(again.sum()) - albedo**2, 0.0))
             shifted = math.sqrt(max(float(again @ (middle - cosine) ** 2), 0.0)) / albedo if albedo > 0.0 else math.nan
             found[:, i] = (
                 albedo,
@@ -269,16 +269,6 @@ def absorbed(table: Table, x: np.ndarray) -> np.ndarray:
                 errors["mean_cosine"] * shifted / spread_c,
             )
     return found
-
-
-def enhancement(table: Table) -> tuple[float, float]:
-    """Return the absorption enhancement B = <l> beta pi R^2 / V and its standard error [1]."""
-    grain, s, e = table.header["grain"], table.statistics, table.header["standard_errors"]
-    value = s["mean_path_length"] * projected_area(table) / grain["volume"]
-    relative = math.hypot(
-        e["mean_path_length"] / max(s["mean_path_length"], 1e-300), e["hit_probability"] / s["hit_probability"]
-    )
-    return value, value * relative
 
 
 def diffuse_reflectance(n: np.ndarray, k: np.ndarray) -> np.ndarray:
@@ -307,7 +297,7 @@ def spectrum(family: Family, constants: Constants, radius: float) -> Spectrum:
     weights, coarser = family.weights(n), family.coarser(n)
     rows = []
     for table in family.tables:
-        b, b_error = enhancement(table)
+        b, b_error = table.absorption_enhancement
         albedo, g, albedo_error, g_error = absorbed(table, np.where(unknown, 0.0, x))
         # n^2 is nearly all that B knows of n, and is exact
         eta2 = float(table.header["optics"]["eta"]) ** 2
@@ -354,6 +344,19 @@ def spectrum(family: Family, constants: Constants, radius: float) -> Spectrum:
         constants, radius, x, found[0], found[1], np.where(unknown, math.nan, albedo_far), g_far, found[2],
         dict(zip(names, noise, strict=True)), dict(zip(names, missed, strict=True)), tuple(notes),
     )  # fmt: skip
+
+
+def columns(found: Spectrum) -> dict[str, np.ndarray]:
+    """Return a spectrum as named columns, each quantity followed by its error."""
+    c = found.constants
+    sheet = {"wavelength_nm": c.wavelength_nm, "n": c.n, "k": c.k, "absorption_times_radius":
+             found.absorption_times_radius}  # fmt: skip
+    for name, values in (
+        ("albedo", found.albedo), ("g", found.g), ("albedo_far", found.albedo_far), ("g_far", found.g_far),
+        ("enhancement", found.enhancement),
+    ):  # fmt: skip
+        sheet[name], sheet[f"{name}_error"] = values, found.error(name)
+    return sheet
 
 
 def moments_of(family: Family, found: Spectrum, orders: int) -> tuple[np.ndarray, np.ndarray]:
@@ -429,7 +432,7 @@ def _converged(family: Family, low: float, high: float, tolerance: float) -> boo
     n = np.linspace(low, high, 65)
     here, there = family.weights(n), family.coarser(n)
     assert there is not None
-    b = np.array([enhancement(table) for table in family.tables]) / family.eta[:, None] ** 2
+    b = np.array([table.absorption_enhancement for table in family.tables]) / family.eta[:, None] ** 2
     g = np.array([(t.statistics["mean_cosine"], t.header["standard_errors"]["mean_cosine"]) for t in family.tables])
     return all(
         (np.abs((here - there) @ values) <= tolerance + 2.0 * np.sqrt((here - there) ** 2 @ errors**2)).all()
