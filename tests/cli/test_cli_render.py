@@ -21,28 +21,7 @@ from tsdf.picture import image
 from tsdf.reference_data.make_checks import CHECKS
 
 WIDTH, HEIGHT = 12, 8
-SCENE = f"""
-[camera]
-position = [0.0, -9.0, 0.0]
-target = [0.0, 0.0, 0.0]
-fov_deg = 30.0
-exposure = -1.0
-width = {WIDTH}
-height = {HEIGHT}
-[render]
-spp = 3
-seed = 5
-[[light]]
-type = "constant"
-radiance = [1.0, 0.5, 0.25]
-[[medium]]
-packing_fraction = 0.4
-radius = 0.05
-shape = {{ type = "sphere", centre = [0.0, 0.0, 0.0], radius = 1.5 }}
-[[medium.grain]]
-table = "cube.tsdf.exr"
-absorption = [2.0, 2.0, 4.0]
-"""
+SCENE = (Path(__file__).parents[1] / "ball.toml").read_text()
 
 
 @pytest.fixture(scope="module")
@@ -205,6 +184,7 @@ def begin(launch: Callable[..., subprocess.Popen], folder: Path) -> Callable[...
     return lambda *words: launch([str(word) for word in (*command, *words)], stdout=-1, stderr=-1, text=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "times"), [(signal.SIGINT, 1), (signal.SIGTERM, 2)])
 def test_an_interrupt_writes_the_picture_so_far(
     number: int, times: int, begin: Callable[..., subprocess.Popen], tmp_path: Path

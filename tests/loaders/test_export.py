@@ -133,6 +133,7 @@ def reflectance(sigma_a: float, sigma_s: float, moments: np.ndarray, thickness: 
 # ----------------------------------------------------------------------------------------------- numbers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("products", [(0.0,) * 3, (0.05,) * 3, (0.001, 0.02, 0.3)])
 def test_every_target_has_the_numbers_of_the_medium(cube: Table, products: tuple[float, float, float]) -> None:
     """Read back by each renderer's own rules, sigma_s and sigma_a are those of `volume_parameters`; g is within range.
@@ -240,6 +241,7 @@ def test_black_grains(ball: Table) -> None:
 # ------------------------------------------------------------------------------------------- put back
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("product", [0.0, 0.02])
 def test_rendering_what_was_written_gives_the_level(ball: Table, product: float) -> None:
     """A slab of 40 R of the exported numbers, by discrete ordinates, reflects as our level volume-hg does.
@@ -480,6 +482,28 @@ def test_npz_holds_the_records_by_entry(tmp_path: Path) -> None:
 GOOD = {"--to": "pbrt", "--packing": "0.6", "--radius": "1"}
 
 
+def test_sizes_densities_and_colours_in_any_word(cube: Table, tmp_path: Path) -> None:
+    """The medium that radius, packing and absorption say, said otherwise; both sides stand in the text."""
+    from tsdf.scene.deep import absorption_of_colour
+    from tsdf.scene.sizes import convert
+
+    facts = convert([(cube, 1.0)], {"radius": 0.5, "packing_fraction": 0.6}, 0.001).facts()
+    xs = absorption_of_colour(cube, (0.9, 0.5, 0.2))
+    ours = ("--radius", 0.5, "--packing", 0.6, "--absorption", ",".join(map(repr, xs)) + "/R")
+    theirs = ("--effective-radius", facts["effective_radius"], "--solid-fraction", facts["solid_fraction"])
+    a, b = (
+        run("--to", "pbrt", *words) for words in (ours, (*theirs, "--deep-colour", "0.9,0.5,0.2", "--unit", "0.001"))
+    )
+    assert b.exit_code == 0, b.stderr
+    for x, y in zip(pbrt_medium(a.stdout).values(), pbrt_medium(b.stdout).values(), strict=True):
+        assert y == (pytest.approx(x, rel=1e-6) if not isinstance(x, str) else x)
+    for part in ("effective_radius", "solid_fraction", "colour 0.9,0.5,0.2 where deep", "/ R = ", "/ unit = ", "/ m"):
+        assert part in b.stdout
+    own = tmp_path / "own.csv"
+    own.write_text("wavelength_nm,n,k\n300,1.5,1e-7\n900,1.5,1e-7\n")
+    assert run("--to", "pbrt", "--packing", 0.6, "--radius", 1, "--material", own, "--unit", 1e-3).exit_code == 0
+
+
 @pytest.mark.parametrize(
     "change, status, part",
     [
@@ -489,6 +513,11 @@ GOOD = {"--to": "pbrt", "--packing": "0.6", "--radius": "1"}
         ({"--radius": "0"}, 2, "--radius"),
         ({"--radius": "-1"}, 2, "--radius"),
         ({"--radius": "inf"}, 2, "--radius"),
+        ({"--sieve": "1"}, 2, "--radius, --sieve"),
+        ({"--density": "1"}, 2, "--packing, --density"),
+        ({"--deep-colour": "1"}, 2, "without any absorption it is 1"),
+        ({"--deep-colour": "0.5", "--absorption": "1"}, 2, "give one"),
+        ({"--material": "none.csv", "--unit": "1"}, 1, "none.csv: no such file"),
         ({"--to": "maya"}, 2, "'karma'"),
         ({"--to": "npz"}, 2, "--out"),
         ({"--absorption": "-1"}, 2, "--absorption"),
