@@ -29,7 +29,7 @@ from tsdf.errors import FormatWarning
 from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
 from tsdf.loaders import export
-from tsdf.loaders.pointmedium import MOST_BOUNCES, PointMedium, bounces, lost, point_medium
+from tsdf.loaders.pointmedium import ENOUGH, MOST_BOUNCES, PointMedium, bounces, lost, point_medium
 from tsdf.make import scatterometer
 from tsdf.make.scatterometer import Effort
 from tsdf.picture import image
@@ -221,7 +221,7 @@ def test_units() -> None:
 def test_two_lobes_only_where_needed(cube: Table) -> None:
     """One lobe where the fit is good, two where it is not and they are better."""
     medium = point_medium(cube, 0.6, 1.0)
-    assert cube.header["fits"]["henyey_greenstein"]["total_variation"] > export.ENOUGH
+    assert cube.header["fits"]["henyey_greenstein"]["total_variation"] > ENOUGH
     assert len(medium.lobes()) == 2 and len(medium.lobes(1)) == 1
     header = dict(cube.header)
     header["fits"] = dict(header["fits"]) | {"henyey_greenstein": {"g": 0.4, "total_variation": 0.01}}
