@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
 from tsdf.picture.world import beam, build
 from tsdf.scene.scene import Absorption, GrainSpec, Slab, Sphere
@@ -109,7 +109,7 @@ def main() -> None:
         "--seconds", type=float, default=20.0, help="of one thread, for each body without and with leaps"
     )
     arguments = parser.parse_args()
-    table = format.read(arguments.table)
+    table = tsdf_format.read(arguments.table)
     for ball, sizes in ((False, arguments.slab), (True, arguments.ball)):
         for size in sizes:
             name = f"{'ball' if ball else 'slab'} {size:g} R, {arguments.level}, f {arguments.packing:g}"

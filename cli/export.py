@@ -77,13 +77,13 @@ def main(
     if out is not None:
         check_output(Path(out), Path(file))
 
-    from tsdf.data import format
+    from tsdf.data import format as tsdf_format
     from tsdf.loaders import export
     from tsdf.loaders.pointmedium import point_medium
     from tsdf.scene.deep import absorption_of_colour
     from tsdf.scene.scene import Absorption, absorbing_material
 
-    table = format.read(file)
+    table = tsdf_format.read(file)
     grains = in_words(table, words, unit)
     packing, radius = grains.fraction, grains.radius
     products = times_radius(absorption, radius, unit, colours=True)

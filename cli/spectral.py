@@ -136,7 +136,7 @@ class Asked(NamedTuple):
         ------
         UsageError, TSDFError
         """
-        from tsdf.data import format
+        from tsdf.data import format as tsdf_format
         from tsdf.grain.constants import constants_over
         from tsdf.grain.grains import load_grain
         from tsdf.make.scatterometer import Effort
@@ -145,7 +145,7 @@ class Asked(NamedTuple):
 
         constants = spectra.Constants.of(constants_over(self.material, spectra.wavelengths(self.wavelength_nm)))
         if self.grains[0].lower().endswith(SUFFIX):
-            family = spectra.Family.of([format.read(Path(name)) for name in self.grains])
+            family = spectra.Family.of([tsdf_format.read(Path(name)) for name in self.grains])
         else:
             grain = load_grain(self.grains[0], False, **self.settings)
             paths = None if grain.kind == "sphere" else self.table_paths

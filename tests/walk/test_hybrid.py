@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
 from tsdf.errors import SceneError
 from tsdf.grain.grains import load_grain
@@ -339,7 +339,7 @@ def test_a_grain_of_a_file(tmp_path: Path, heap: Scene, monkeypatch: pytest.Monk
     grain = load_grain(tmp_path / "tables" / "rock.stl")
     build = scatterometer.Build.start(grain, Optics(1.31), Effort(2_000, memory=4))
     build.run(grain, 1)
-    format.write(build.table(), tmp_path / "tables" / "rock.tsdf.exr")
+    tsdf_format.write(build.table(), tmp_path / "tables" / "rock.tsdf.exr")
     spec = GrainSpec(tmp_path / "tables" / "rock.tsdf.exr")
     scene = replace(heap, media=(replace(heap.media[0], grains=(spec,)),), folder=str(tmp_path / "scenes"))
     monkeypatch.chdir(tmp_path / "here")

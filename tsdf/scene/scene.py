@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
 from tsdf.errors import SceneError, TSDFError, UsageError
 from tsdf.grain import constants
@@ -281,7 +281,7 @@ def _in_numbers(medium: MediumSpec, metres_per_unit: float | None, at: Place) ->
     if not medium.sizes and not any(coloured):
         return medium
     try:
-        tables = [g.table if isinstance(g.table, Table) else format.read(g.table) for g in medium.grains]
+        tables = [g.table if isinstance(g.table, Table) else tsdf_format.read(g.table) for g in medium.grains]
         if medium.sizes:
             shares = [(table, grain.fraction) for table, grain in zip(tables, medium.grains, strict=True)]
             packed = convert(shares, dict(medium.sizes), metres_per_unit)
