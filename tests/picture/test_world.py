@@ -150,7 +150,7 @@ def test_each_file_is_read_once(tmp_path, ball, monkeypatch):
     grains = tuple(GrainSpec(tmp_path / names[i % 3]) for i in range(64))
     reads = []
     original = tsdf_format.read
-    monkeypatch.setattr(format, "read", lambda path: reads.append(path) or original(path))
+    monkeypatch.setattr(tsdf_format, "read", lambda path: reads.append(path) or original(path))
     scene = Scene(replace(CAMERA, position=(-9.0, 0.0, 0.0)), ONE, (MediumSpec(CUBE, 0.5, 0.1, grains),))
     made = world.build(scene, "teleport")
     assert len(reads) == 1

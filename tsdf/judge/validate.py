@@ -1,4 +1,4 @@
-"""Is a table right? Its structure, its statistics against its pixels, and both against physics.
+"""Validation: is a table right? Its structure, its statistics against its pixels, and both against physics.
 
 `validate` runs three parts: the structure (`format.check`), what the header says about the pixels and about
 itself (codes ``STATISTICS_``), and what is known of the grain without tracing it (``PHYSICS_``): the exact sphere,

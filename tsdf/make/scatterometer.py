@@ -1,4 +1,4 @@
-"""How a table is made: a grain, its optics and an effort in, a `Table` out.
+"""Scatterometer: how a table is made; a grain, its optics and an effort in, a `Table` out.
 
 Paths are numbered, and all counts are integers that add up in any order, so the same request gives the same bytes for
 any number of threads, interrupted and resumed or not, in one piece or in parts merged afterwards. What counts is only

@@ -1,4 +1,4 @@
-"""A scene at one level of detail, as the arrays that `transport` follows light through.
+"""World: a scene at one level of detail, as the arrays that `transport` follows light through.
 
 Media become numbers in `media`; how light uses them is `transport`, pictures are `render`. The levels, cheapest first:
 isotropic (point scatterers, similarity), volume-hg (one Henyey-Greenstein lobe), volume (tabulated deflections),

@@ -1,4 +1,4 @@
-"""How right each level is where it can be told exactly: diffusion in the bulk, and slabs, against packed grains.
+"""Accuracy: how right each level is where it can be told exactly; bulk diffusion and slabs, against packed grains.
 
 What is measured is `experiment`; here it is done for every level, fraction and slab. Errors of packed grains come from
 the paths and from the spread over packings. Errors of whole pictures are `compare`'s, charts `plots`'.

@@ -1,4 +1,4 @@
-"""Pictures of tables, by matplotlib, which is imported here and nowhere else, and only when a picture is drawn.
+"""Plots: pictures of tables by matplotlib, which is imported only when one is drawn.
 
 Figures are made without pyplot, so nothing global changes, and `save` writes the same bytes for the same table.
 """
