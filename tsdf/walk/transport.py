@@ -31,7 +31,7 @@ from tsdf.sampling import GOLDEN, key_of, mix, unit
 from tsdf.vectors import KERNEL, cross, dot, frame, minus, renewed, step, triple
 from tsdf.walk import explicit as X
 from tsdf.walk import memory as M
-from tsdf.walk.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit
+from tsdf.walk.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit, unmet
 from tsdf.walk.grid import GRAZING, march, plane_hit
 from tsdf.walk.hybrid import hand_over
 from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, Leaps, leap, missing, patience
@@ -276,8 +276,8 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
     mean, reach, travel = media.free[m], media.reach[m], media.travel[m]
     first, last = media.first[m], media.first[m] + media.kinds[m] - 1
     luck, pdf, steps, leapt, state = w.luck, w.pdf, 0, 0, LOOK
-    most = min(PATIENCE, media.limit - w.events)
-    bound, fresh = clearance(g, m, p), True
+    most, spot = min(PATIENCE, media.limit - w.events), batch.hits.shape[0] - 1
+    bound, fresh = 0.0 if once else clearance(g, m, p), True
     convex, hair = alone(g, m), HAIR * g.slack[m]
     again = NEVER if once else patience(world.leaps, m, missing(world.leaps, m, bound))
     while True:
@@ -288,7 +288,10 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
             if not fresh:
                 bound = clearance(g, m, p)
             if bound <= free and not (convex and bound > 0.0 and clearance(g, m, step(p, free, d)) > hair):
-                break
+                sure, known = unmet(g, batch.hits[spot], m, p, d, free)
+                if not sure:
+                    w.ray = spot if known else NONE
+                    break
         if steps >= most or (not once and full(batch)):
             state = WAIT
             break
@@ -348,9 +351,13 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
             if bound <= size and size > 0.0:
                 aim(w, offset, size, d, length, c)
                 end = step(p, size, triple(w.e))
-                if convex and bound > 0.0 and clearance(g, m, end) > hair:
+                sure, known = convex and bound > 0.0 and clearance(g, m, end) > hair, False
+                if not sure:
+                    sure, known = unmet(g, batch.hits[spot], m, p, triple(w.e), size)
+                if sure:
                     w.mode, p, bound = FLY, end, 0.0
                 else:
+                    w.ray = spot if known else NONE
                     once = True
             else:
                 p = step(p, scale, offset)
