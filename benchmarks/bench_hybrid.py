@@ -116,34 +116,27 @@ def timed(scene: Scene, level: str, k: int, spp: int, seeds: tuple[int, ...]) ->
     return pictures, (time.process_time() - began) / len(seeds)
 
 
-def beads(effort: float, width: int = 320, write: Path | None = None) -> None:
+def beads(effort: float, width: int = 320) -> None:
     """Print how far the beads are from those traced one by one, in the picture and where there are beads."""
     scene = resized(load(Path(__file__).parents[1] / "scenes" / "beads.toml"), width)
     spp = max(4, int(effort * 48))
     truth, taken = timed(scene, "explicit", 0, spp, (1, 2))
-    # Pixels of the pile: where a picture without the table's texture would be, where grains are met
     bare = timed(replace(scene, media=()), "explicit", 0, spp, (3,))[0][0].rgb @ LUMINANCE
     light = [picture.rgb @ LUMINANCE for picture in truth]
     pile = np.abs(0.5 * (light[0] + light[1]) - bare) > 0.1 * bare
-    mean = np.mean(light)
-    print(f"beads {width} wide, {spp} spp | k | rms [% of the mean] | in the pile | mean of |difference| | noise of it "
-          "| bias [%] | time to teleport-memory")  # fmt: skip
-    base = 0.0
+    mean, base = np.mean(light), 0.0
+    print(f"beads {width} wide, {spp} spp: k | rms [% of the mean] | in the pile | bias [%] | variance to explicit "
+          "| time per sample to teleport-memory")  # fmt: skip
     for k in (0, 2, 5, 10):
         made, own = timed(scene, "teleport-memory", k, spp, (1, 2))
         base = base or own
         one, other = (picture.rgb @ LUMINANCE - it for picture, it in zip(made, light, strict=True))
         square = one * other / mean**2
-        deviation = sum(picture.variance @ LUMINANCE**2 for picture in (*made, *truth)) / 4.0
         rms, inside = (100.0 * math.sqrt(max(0.0, some.mean())) for some in (square, square[pile]))
-        absolute, noise = np.abs(0.5 * (one + other)).mean(), np.sqrt(2.0 / math.pi * deviation).mean()
-        print(f"{k} | {rms:.1f} | {inside:.1f} | {100 * absolute / mean:.1f} | {100 * noise / mean:.1f} "
-              f"| {100 * 0.5 * (one + other).mean() / mean:+.2f} | {own / base:.2f}", flush=True)  # fmt: skip
-        if write is not None:
-            image.write_png(write / f"beads{k}.png", 0.5 * (made[0].rgb + made[1].rgb), scene.camera.exposure)
-    print(f"explicit | | | | | | {taken / base:.2f}")
-    if write is not None:
-        image.write_png(write / "beads_explicit.png", 0.5 * (truth[0].rgb + truth[1].rgb), scene.camera.exposure)
+        variance = made[0].variance.mean() / truth[0].variance.mean()
+        print(f"{k} | {rms:.1f} | {inside:.1f} | {100 * 0.5 * (one + other).mean() / mean:+.2f} | {variance:.2f} "
+              f"| {own / base:.2f}", flush=True)  # fmt: skip
+    print(f"explicit | | | | 1 | {taken / base:.2f}")
 
 
 def facets(effort: float, folder: Path) -> None:

@@ -36,7 +36,7 @@ MEASURED = ("explicit", "teleport-packed", "teleport-memory", "teleport-joint", 
     help="Thickness of the layer of centres of a slab's grains [R]; may be given several times.",
 )  # fmt: skip
 @click.option("--levels", metavar="A,B,..", help=f"Levels to measure.  [default: {','.join(MEASURED)}]")
-@click.option("--mesh", type=click.Path(path_type=Path), metavar="FILE", help="Of a grain that is not built in.")
+@click.option("--mesh", type=click.Path(path_type=Path), metavar="FILE", help="Of a grain that is not beside TABLE.")
 @click.option(
     "--seconds", type=float, metavar="S",
     help="Time of measuring, after a start that makes packings and compiles once for this machine.  [default: 300]",

@@ -190,7 +190,7 @@ def test_the_next_sphere_is_that_of_the_packing(ball: Table) -> None:
     scene = Scene(
         ABOVE, (WHITE,), (MediumSpec(Sphere((0.0,) * 3, 500.0), 0.6, 1.0, (GrainSpec(ball),), packing_spheres=FEW),)
     )
-    made = world.build(replace(scene, render=Render(explicit_grains=2)), "teleport-memory")
+    made = world.build(replace(scene, render=Render(explicit_grains=2)), "teleport-memory", leap=0.0)
     walkers, arrays, room = Walkers(made), Handle(made.packed.arrays), Handle(made.place.room)
     walkers.asked[MOST] = 2  # room for more
     n, rng = 1_000, np.random.default_rng(1)
@@ -324,6 +324,13 @@ def test_what_is_said(heap: Scene, ball: Table) -> None:
     mirrors = replace(heap, media=(replace(heap.media[0], grains=(GrainSpec(build.table()),)),))
     (note,) = (n for n in world.build(asking(mirrors, 1), "teleport").notes if "mean cosine" in n)
     assert "take level explicit" in note
+    for shape, inside, thin in (
+        (Slab(0.0, 6.5), "grains", False), (Slab(0.0, 6.0), "grains", True), (Slab(0.0, 4.5), "centres", False),
+        (Slab(0.0, 4.0), "centres", True),
+    ):  # fmt: skip
+        layer = replace(heap, media=(replace(heap.media[0], shape=shape),), surfaces=())
+        said = [n for n in world.build(asking(layer, 1, inside), "teleport").notes if "a layer of 4 R" in n]
+        assert len(said) == thin
 
 
 def test_a_grain_of_a_file(tmp_path: Path, heap: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -269,8 +269,11 @@ def build(
                     f"build it with {records.option}"
                 )
     memory = _memory(scene, tables if traits.remembers or traits.answered else [], traits.remembers)
+    layers = []
     for number, (medium, boundary) in enumerate(zip(scene.media, made.boundaries, strict=True), 1):
         extent = _extent(medium, boundary.vertices if boundary is not None else None)
+        sticks_out = medium.inside == "centres" and boundary is None
+        layers.append(extent / medium.radius - (0.0 if sticks_out else 2.0))
         if 2.0 * medium.radius > extent and medium.inside == "grains":
             notes.append(
                 f"{scene.name}: {called('medium', number, medium.name)}: a grain of diameter {2.0 * medium.radius:g} "
@@ -292,7 +295,7 @@ def build(
             "tell; widen the sun or light by a smooth sky"
         )
     if singles and not traits.packed:
-        notes += hybrid_notes(scene, tables)
+        notes += hybrid_notes(scene, tables, layers)
     grains = nothing_packed(len(scene.media), len(tables))
     if singles and scene.media:
         grains = packed(scene, tables, traced=not traits.answered)
