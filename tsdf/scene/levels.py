@@ -22,6 +22,16 @@ class Traits(NamedTuple):
         return self.remembers or self.packed
 
     @property
+    def leaps(self) -> bool:
+        """Whether many events can be taken in one step: grains are drawn anew wherever light comes."""
+        return not self.packed
+
+    @property
+    def chains(self) -> bool:
+        """Whether light goes from grain to grain by a law, so that it can begin at any grain; see `walk.hybrid`."""
+        return self.jumps or self.remembers
+
+    @property
     def points(self) -> bool:
         """Whether grains are points, that know no path length inside."""
         return self.lobe or self.similar
