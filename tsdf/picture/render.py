@@ -245,7 +245,7 @@ def measure(
     goal = Goal(spp, seconds, target_error)
     threads = threads or os.cpu_count() or 1
     stop, halt = stop or threading.Event(), threading.Event()
-    met = world.media.traits.packed and bool(world.scene.media) and world.lights.sampled  # by chance alone
+    met = world.media.singles > 0 and bool(world.scene.media) and world.lights.sampled  # by chance alone
     sums, count = Sums(width, height, kurtosis_of(world.lights) if met else 0.0), width * height
     pool = [Walkers(world) for _ in range(threads)]
     pool[0].follow(T.Job(camera, 0, 1, 0, seed), 1, halt)  # compiles, outside the time
