@@ -84,7 +84,8 @@ def compared(name: str, table: Table, arguments: Any, size: float, ball: bool) -
     both = np.hypot(error[0][bins] / mean[0][bins].sum(), error[1][bins] / mean[1][bins].sum())
     variation = 50.0 * np.abs(difference).sum(), 50.0 * math.sqrt(2.0 / math.pi) * both.sum()
     changes = " ".join(
-        f"{what} {change[k]:+.2f}({noise[k]:.2f})" for what, k in zip(("R", "T", *map(str, KEPT), "N"), (0, 1, 2, 3, -3))
+        f"{what} {change[k]:+.2f}({noise[k]:.2f})"
+        for what, k in zip(("R", "T", *map(str, KEPT), "N"), (0, 1, 2, 3, -3))
     )
     return (
         f"{name}: N {mean[0][-3]:.4g}, drawn {mean[0][-2]:.4g} -> {mean[1][-2]:.3g}, {mean[0][-1] / mean[1][-1]:.2f} times "
@@ -104,7 +105,9 @@ def main() -> None:
     parser.add_argument("--slab", type=float, nargs="*", default=[20.0, 40.0, 100.0, 400.0, 2000.0])
     parser.add_argument("--ball", type=float, nargs="*", default=[400.0])
     parser.add_argument("--gamma", type=float, default=2.0)
-    parser.add_argument("--seconds", type=float, default=20.0, help="of one thread, for each body without and with leaps")
+    parser.add_argument(
+        "--seconds", type=float, default=20.0, help="of one thread, for each body without and with leaps"
+    )
     arguments = parser.parse_args()
     table = format.read(arguments.table)
     for ball, sizes in ((False, arguments.slab), (True, arguments.ball)):

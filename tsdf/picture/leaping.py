@@ -89,7 +89,10 @@ def leaping(
         radius, mean = medium.radius, float(media.free[m])
         if traits.remembers and not place.room.whole[m] and place.arrays.kind[m] == MESH:
             continue  # where its grains stand is not told by how far the boundary is
-        grains = [Component(table, grain.fraction, radius) for table, grain in zip(own[first:last], medium.grains, strict=True)]
+        grains = [
+            Component(table, grain.fraction, radius)
+            for table, grain in zip(own[first:last], medium.grains, strict=True)
+        ]
         path = free_path(grains, medium.packing_fraction)
         unit[m] = radius if traits.spheres else mean
         touched = TOUCHED * radius if traits.remembers else float(media.reach[m])

@@ -693,6 +693,8 @@ _SURFACE = _table(
     shape=_section(_tagged(rectangle=_RECTANGLE, mesh=_MESH, box=_BOX, sphere=_SPHERE)),
     reflectance=_colour(1.0),
 )
+
+
 def _leap(value: Any, key: str, at: _Place) -> float:
     """Read the smallest radius of leaps: 0 for none, else 1 or more."""
     leap: float = _number(0.0)(value, key, at)
@@ -724,9 +726,7 @@ _SCENE = _table(
     metres_per_unit=_POSITIVE,
     camera=_section(_CAMERA),
     render=_section(
-        _table(
-            Render, _check_render, level=_choice(LEVELS), spp=_integer(1, MAX_SAMPLES), seed=_integer(), leap=_leap
-        )
+        _table(Render, _check_render, level=_choice(LEVELS), spp=_integer(1, MAX_SAMPLES), seed=_integer(), leap=_leap)
     ),
     light=_tables("[[light]]", _LIGHT, MAX_LIGHTS),
     medium=_tables("[[medium]]", _MEDIUM, MAX_MEDIA),
