@@ -82,8 +82,8 @@ def heap(ball, radius, shape=CUBE, camera=None, absorption=0.0):
 
 
 def test_grains_too_small_for_their_medium_are_refused(ball):
-    """Grains of 1e-12 in a box of 4: a path without leaps would meet 1e12. Where they absorb, paths end, and the scene is
-    built; from 1e5 grains on a note says how long it takes."""
+    """Grains of 1e-12 in a box of 4: a path without leaps would meet 1e12. Where they absorb, paths end, and the scene
+    is built; from 1e5 grains on a note says how long it takes."""
     for level in ("teleport", "volume-hg", "isotropic"):
         with pytest.raises(
             SceneError, match=r"heap: \[\[medium\]\] 1 \(heap\): light meets about .*take larger grains"

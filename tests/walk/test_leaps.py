@@ -14,14 +14,13 @@ from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
 from tsdf.make import scatterometer
 from tsdf.make.scatterometer import Effort
-from tsdf.picture import leaping, render, world
+from tsdf.picture import leaping, render
 from tsdf.picture.world import World, beam, build
 from tsdf.scene.scene import (
     Absorption,
     Camera,
     ConstantLight,
     GrainSpec,
-    MediumSpec,
     Mesh,
     Scene,
     Slab,
@@ -278,7 +277,7 @@ def test_levels_that_cannot_leap(ball: Table) -> None:
 
 
 def test_what_would_never_end_is_rendered(ball: Table) -> None:
-    """A ball of 1e8 grains across, lossless, that holds the camera: 1e15 events a path, which no path is given up for."""
+    """A ball of 1e8 grains across, lossless, that holds the camera: 1e15 events a path, and none is given up."""
     scene = scene_of(Sphere((0.0, 0.0, 0.0), 1e8), GrainSpec(ball), 0.6, inside="grains")
     scene = replace(scene, camera=Camera((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2, 1))
     with pytest.raises(SceneError, match=r"light meets about .*take larger grains"):

@@ -222,8 +222,8 @@ def build(
     limit : int
         Grains met after which a path is given up; many more, if it is not given, where paths leap over most of them.
     leap : float, optional
-        Radius of the smallest leap in transport mean free paths, 0 for none; else what the scene says, or `GAMMA`, where
-        the level leaps at all.
+        Radius of the smallest leap in transport mean free paths, 0 for none; else what the scene says, or `GAMMA`,
+        where the level leaps at all.
     progress : callable, optional
         Called with the share done and a word about it while records for leaps are made.
 

@@ -163,7 +163,8 @@ def follow(
         pool.shutdown(cancel_futures=True)
     ends = [one for _, one in found]
     start, place, way, weight, amounts = (np.concatenate([one[k] for one in ends]) for k in range(5))
-    events, drawn, taken = (sum(one[k] for one in ends) for k in range(5, 8))
+    events, drawn, taken = (sum(one.events for one in ends), sum(one.drawn for one in ends),
+                            sum(one.seconds for one in ends))  # fmt: skip
     return np.concatenate([places for places, _ in found]), Ends(
         start, place, way, weight, amounts, events, drawn, taken
     )
@@ -187,9 +188,9 @@ class Sums:
     total: np.ndarray | float = 0.0
     squares: np.ndarray | float = 0.0
     events: int = 0
-    drawn: int = 0
     seconds: float = 0.0
     lost: int = 0
+    drawn: int = 0
 
     def add(self, values: np.ndarray, ends: Ends) -> None:
         there = np.isfinite(values).all(axis=1)

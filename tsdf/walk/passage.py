@@ -2,7 +2,8 @@
 
 For a level and what a medium is made of. `leaps` takes many events in one step by them and says what a ball is. They
 are made by the very chain that a walker follows (`transport`, `memory`), in an endless medium, once, and kept in the
-user's cache beside the packings. Lengths are in the level's own unit: R where grains are spheres, else the mean free path.
+user's cache beside the packings. Lengths are in the level's own unit: R where grains are spheres, else the mean free
+path.
 
 The chain is in the state of one that enters the next sphere, or meets the next point, at p along d, at the side t with
 impact parameter b; where it will be in the end is E[p_oo] = M = p + K(b) d + H(b) t. M is a martingale: its steps have
@@ -41,16 +42,7 @@ CLASSES = 8  # of radii, each sqrt 2 of the one before
 LEAST_RADIUS = 6.0  # [R] of the first class where grains are spheres: smaller balls are of a few grains
 RECORDS = 4096  # of each class
 FEWEST = 512  # where light hardly turns, and a record takes very many events
-TRIED = (
-    16,
-    16,
-    16,
-    16,
-    8,
-    8,
-    4,
-    4,
-)  # times as many, whose mean depth the records are given: small balls are the ones used
+TRIED = (16, 16, 16, 16, 8, 8, 4, 4)  # times as many whose means the records are given, most of the balls most used
 BUDGET = 6e7  # events that making records may take, unless there would be fewer than FEWEST
 DRAWS = 1 << 20  # of deflections, for their means
 BATCHES = 16  # of these draws: the errors are what they differ by
@@ -82,8 +74,8 @@ class Passage:
         corrected for, and its standard error.
     records : (classes, n, 8) float32
         Where and whither the last grain was left: depth below the ball's surface; cosine nu between the way there from
-        the middle, u, and the direction at the start, d_0; cosine mu between u and the direction d now; azimuth chi of d
-        about u, from d_0 [turns]. What is entered next: azimuth psi of its side about d, from u [turns]; its impact
+        the middle, u, and the direction at the start, d_0; cosine mu between u and the direction d now; azimuth chi of
+        d about u, from d_0 [turns]. What is entered next: azimuth psi of its side about d, from u [turns]; its impact
         parameter; the flight there, still pending. And N.
     crossed : (classes, n, components + 1) float32
         Path length in the matter of each component [R], events where it has none; and the length flown.
@@ -113,8 +105,8 @@ def component(choice, first, last, u):
 
 @njit(**KERNEL)
 def drawn(chain, m, first, last, seed, sums):
-    """Add up what the mean step needs over draws `first` to `last` of a level that draws free paths: g, z, the square of
-    the offset, and its part along the new direction; lengths in R."""
+    """Add up what the mean step needs over draws `first` to `last` of a level that draws free paths: cosines, z, the
+    square of the offset, and its part along the new direction; lengths in R."""
     media = chain.media
     begin = media.first[m]
     end = begin + media.kinds[m] - 1
@@ -356,10 +348,10 @@ def _ahead(records: np.ndarray, means: Means) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _corrected(tried: Sequence[np.ndarray], radius: np.ndarray, turn: float, means: Means) -> np.ndarray:
-    """Return `Passage.numbers`, and correct records, those that will be kept, by what is known better than they know it.
+    """Return `Passage.numbers`, and correct the records that will be kept by what is known better than they know it.
 
-    M is in the middle of the ball in the mean, and the mean of its square tells that of N. A is a smooth function of the
-    radius.
+    M is in the middle of the ball in the mean, and the mean of its square tells that of N. A is a smooth function of
+    the radius.
     """
     count = min(len(one) // times for one, times in zip(tried, TRIED, strict=True))
     parts = [_ahead(one, means) for one in tried]
@@ -412,7 +404,7 @@ def made(
             means = _of_free_paths(handle, m, mean, scale, pool)
         turn = means.step2 / (2.0 * means.shift)
         radius = max(turn, LEAST_RADIUS * scale) * 2.0 ** (0.5 * np.arange(CLASSES))
-        events = float((TRIED * (radius + turn) ** 2).sum() / means.step2)
+        events = float(np.dot(TRIED, (radius + turn) ** 2)) / means.step2
         count = int(min(RECORDS, max(FEWEST, BUDGET / events)))
         tried = [np.zeros((times * count, GRAINS + 1)) for times in TRIED]
         crossed = [np.zeros((times * count, kinds + 1)) for times in TRIED]
@@ -427,7 +419,7 @@ def made(
                 flown(handle, m, (*where, mean), means.ahead, tried[k], crossed[k])
             return (last - first) * float(radius[k]) ** 2
 
-        done, total = 0.0, count * float((TRIED * radius**2).sum())
+        done, total = 0.0, count * float(np.dot(TRIED, radius**2))
         for part in pool.map(one, jobs):
             done += part
             if progress is not None:
