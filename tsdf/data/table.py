@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,6 +35,13 @@ def thawed(value: Any) -> Any:
     return value
 
 
+class Measured(NamedTuple):
+    """A number and its standard error, 0 where it is exact."""
+
+    value: float
+    error: float
+
+
 @dataclass(frozen=True, eq=False)
 class Table:
     """The scattering of one grain; immutable.
@@ -46,6 +53,15 @@ class Table:
     pixels : (rows, columns) float32
         Columns are cells of cos theta in ascending order, rows are stacked blocks as ``header["blocks"]`` lists them.
         An array that can be written to is copied.
+
+    Examples
+    --------
+    >>> import tsdf
+    >>> table = tsdf.read("cube.tsdf.exr")
+    >>> table.p_theta.shape, float(table.p_theta[-1])  # the last column is the atom of light that goes straight on
+    ((18,), 0.32733437418937683)
+    >>> round(table.albedo(0.1), 4)  # of a grain whose sigma_a times R is 0.1
+    0.8808
     """
 
     header: Mapping[str, Any]
@@ -188,3 +204,86 @@ class Table:
         edges = self.cos_theta_edges
         middle = 0.5 * (edges[1:] + edges[:-1])
         return min(max(float(lossless + middle @ (masses - self.deflection_masses())), -1.0), 1.0)
+
+    # --- in others' words, with standard errors; docs/glossary.md -----------------------------------------------------
+
+    @property
+    def projected_area(self) -> Measured:
+        """Mean area A of the grain's shadow over all directions [R^2]: hit_probability pi."""
+        return self._scaled("hit_probability", math.pi)
+
+    @property
+    def effective_radius(self) -> Measured:
+        """3 V / (4 A), A the projected area [R]."""
+        area, error = self.projected_area
+        radius = 0.75 * float(self.header["grain"]["volume"]) / area
+        return Measured(radius, radius * error / area)
+
+    @property
+    def absorption_enhancement(self) -> Measured:
+        """B = <l> A / V [1]: how much longer light is in the material than in a grain that does not refract."""
+        (area, area_error), (length, length_error) = self.projected_area, self._scaled("mean_path_length", 1.0)
+        b = length * area / float(self.header["grain"]["volume"])
+        return Measured(b, b * math.hypot(area_error / area, length_error / length if length > 0.0 else 0.0))
+
+    @property
+    def dark_share(self) -> Measured:
+        """Share of the directions inside, over the volume, that outside light cannot reach [1]: 1 - B / eta^2."""
+        (b, error), square = self.absorption_enhancement, float(self.header["optics"]["eta"]) ** 2
+        return Measured(1.0 - b / square, error / square)
+
+    def single_scattering_albedo(self, absorption_times_radius: float = 0.0) -> Measured:
+        """Return the share w of the light that met the grain and is not absorbed in it [1], without diffraction.
+
+        It is `albedo` over that of the lossless grain: what the tracer dropped is no absorption. Its error is that of
+        mean_path_length, by the variances of the path length and of what it leaves.
+        """
+        if absorption_times_radius == 0.0:
+            return Measured(1.0, 0.0)
+        p = self.p_theta / self.p_theta.sum()
+        kept, squares = (float(p @ self.survival(by * absorption_times_radius)) for by in (1.0, 2.0))
+        variance = self._path_variance()
+        error = float(self.header["standard_errors"]["mean_path_length"])
+        if not variance > 0.0:
+            return Measured(kept, absorption_times_radius * kept * error)
+        return Measured(kept, error * math.sqrt(max(0.0, squares - kept * kept) / variance))
+
+    def asymmetry_factor(self, absorption_times_radius: float = 0.0) -> Measured:
+        """Return the mean cosine g of geometrical optics, `mean_cosine`; its error by the energy that is left [1]."""
+        g = self.mean_cosine(absorption_times_radius)
+        p = self.p_theta / self.p_theta.sum()
+        edges = self.cos_theta_edges
+        middle = 0.5 * (edges[1:] + edges[:-1])
+        error = float(self.header["standard_errors"]["mean_cosine"])
+        lossless = self.mean_cosine()
+        spread = float(p @ (middle - lossless) ** 2)
+        if math.isnan(g) or not spread > 0.0:
+            return Measured(g, error)
+        kept, squares = (self.survival(by * absorption_times_radius) for by in (1.0, 2.0))
+        left = float((p * squares) @ (middle - g) ** 2) / float(p @ kept) ** 2
+        return Measured(g, error * math.sqrt(left / spread))
+
+    def asymmetry_factor_far_field(self, absorption_times_radius: float = 0.0) -> Measured:
+        """Return the mean cosine with diffraction, as large as the shadow and straight on [1]: (1 + w g) / (1 + w).
+
+        The extinction efficiency is then 2 and the single-scattering albedo (1 + w) / 2.
+        """
+        (w, w_error), (g, g_error) = (
+            self.single_scattering_albedo(absorption_times_radius),
+            self.asymmetry_factor(absorption_times_radius),
+        )
+        if math.isnan(g):  # all that is left is diffracted
+            return Measured(1.0, 0.0)
+        error = math.hypot(w * g_error / (1.0 + w), (1.0 - g) * w_error / (1.0 + w) ** 2)
+        return Measured((1.0 + w * g) / (1.0 + w), error)
+
+    def _scaled(self, name: str, by: float) -> Measured:
+        """Return one of the statistics times a factor."""
+        return Measured(by * float(self.statistics[name]), by * float(self.header["standard_errors"][name]))
+
+    def _path_variance(self) -> float:
+        """Return the variance of the path length, by the cells [R^2]."""
+        p = self.p_theta / self.p_theta.sum()
+        lengths = self.block("mean_l").astype(np.float64)
+        mean, square = (float(p @ (self.p_l * lengths**power).sum(axis=0)) for power in (1, 2))
+        return max(0.0, square - mean * mean)

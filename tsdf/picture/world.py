@@ -3,13 +3,14 @@
 Media become numbers in `media`; how light uses them is `transport`, pictures are `render`. The levels, cheapest first:
 isotropic (point scatterers, similarity), volume-hg (one Henyey-Greenstein lobe), volume (tabulated deflections),
 teleport (Algorithm 1 of Meng et al. 2015), teleport-joint (its offsets kept together), teleport-memory (where
-neighbours are as well), explicit (packed grains, traced).
+neighbours are as well), teleport-packed (packed grains, answered by records), explicit (packed grains, traced).
 """
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import assert_never
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,10 +39,12 @@ from tsdf.scene.scene import (
     SunLight,
     called,
 )
-from tsdf.spheres.neighbours import law
+from tsdf.scene.sizes import MATERIAL_DENSITY, InWords, grain_sizes
+from tsdf.spheres.packing_table import law
 from tsdf.vectors import frame
 from tsdf.walk.explicit import Packed, nothing_packed, packed
 from tsdf.walk.geometry import MESH, Place, Triangles, ball_hit, exact_hit, place
+from tsdf.walk.hybrid import hybrid_notes, singles_of
 from tsdf.walk.leaps import Leaps
 from tsdf.walk.lights import LightArrays, compile_lights
 from tsdf.walk.memory import Memory, memory_of
@@ -70,8 +73,10 @@ class World:
         Radius of the smallest leap in transport mean free paths, 0 where no medium is deep enough.
     place : Place
         Geometry and its ray engine.
+    brim : Place
+        Where the chain goes on after the first grains if that is another place: media that it fills to the brim.
     packed : Packed
-        Grains of the explicit level.
+        Grains that are met one by one.
     media, tables, memory, leaps, lights, absorption
         Arrays for kernels.
     amounts : int
@@ -80,12 +85,15 @@ class World:
         Of the media, at the luminance-weighted mean of their absorption.
     notes : tuple of str
         What the user should know, one line each.
+    sizes : tuple of InWords
+        Of the media, in everybody's words.
     """
 
     scene: Scene
     level: str
     leap: float
     place: Place
+    brim: Place
     packed: Packed
     media: Media
     tables: Tables
@@ -96,6 +104,7 @@ class World:
     amounts: int
     parameters: tuple[VolumeParameters, ...]
     notes: tuple[str, ...]
+    sizes: tuple[InWords, ...]
 
 
 def camera_of(world: World) -> Camera:
@@ -234,7 +243,8 @@ def build(
     """
     if level not in LEVELS:
         raise SceneError(f"{scene.name}: no level {level!r}; levels are {', '.join(LEVELS)}")
-    traits, gamma = LEVELS[level].traits, _gamma(scene, level, leap)
+    traits, singles = LEVELS[level].traits, singles_of(scene, level)
+    gamma = _gamma(scene, level, leap)
     read: dict[str, Table] = {}
 
     def table_of(spec: GrainSpec) -> Table:
@@ -246,7 +256,9 @@ def build(
         return read[file]
 
     tables = [table_of(grain) for medium in scene.media for grain in medium.grains]
-    made = place(scene, grains=traits.placed)
+    made = brim = place(scene, grains=traits.placed or singles > 0)
+    if not traits.placed and singles and any(medium.inside == "centres" for medium in scene.media):
+        brim = place(scene)
     notes = list(made.notes)
     media, absorption, parameters = media_of(scene, traits, tables, limit)
     if records := LEVELS[level].records:
@@ -256,7 +268,7 @@ def build(
                     f"{scene.name}: {grain.table} has no {records.name}, which level {level} draws from; "
                     f"build it with {records.option}"
                 )
-    memory = _memory(scene, tables if traits.remembers else [])
+    memory = _memory(scene, tables if traits.remembers or traits.answered else [], traits.remembers)
     for number, (medium, boundary) in enumerate(zip(scene.media, made.boundaries, strict=True), 1):
         extent = _extent(medium, boundary.vertices if boundary is not None else None)
         if 2.0 * medium.radius > extent and medium.inside == "grains":
@@ -266,26 +278,32 @@ def build(
             )
     lights, said = _lights(scene)
     compiled = compile_tables(tables or [_no_table()], joint=traits.joint)
-    leaps, deep = leaping(scene, made, media, compiled, memory, tables, gamma, bool(lights.sampled), progress)
+    leaps, deep = leaping(scene, brim, media, compiled, memory, tables, gamma, bool(lights.sampled), progress)
     met = _grains_met(scene, traits, tables, made, parameters, limit)
     if any(deep) and limit == MAX_EVENTS:
         longest = OUTLIVED * max(n for n, there in zip(met, deep, strict=True) if there)
         media = media._replace(limit=int(min(max(limit, longest), MOST_EVENTS)))
     notes += _long_paths(scene, [0.0 if there else n for n, there in zip(met, deep, strict=True)])
     notes += said
-    if traits.packed and scene.media and lights.sampled:
+    if singles and scene.media and lights.sampled:
         notes.append(
-            f"{scene.name}: level explicit meets suns and small bright lights by chance alone: until many samples "
-            "have, the picture is too dark and its variance does not tell; widen the sun or light by a smooth sky"
+            f"{scene.name}: {f'level {level} meets' if traits.packed else 'explicit grains meet'} suns and small "
+            "bright lights by chance alone: until many samples have, the picture is too dark and its variance does not "
+            "tell; widen the sun or light by a smooth sky"
         )
-    grains = packed(scene, tables) if traits.packed and scene.media else nothing_packed(len(scene.media), len(tables))
+    if singles and not traits.packed:
+        notes += hybrid_notes(scene, tables)
+    grains = nothing_packed(len(scene.media), len(tables))
+    if singles and scene.media:
+        grains = packed(scene, tables, traced=not traits.answered)
     return World(
         scene=scene,
         level=level,
         leap=gamma if any(deep) else 0.0,
         place=made,
+        brim=brim,
         packed=grains,
-        media=media,
+        media=media._replace(singles=singles),
         tables=compiled,
         memory=memory,
         leaps=leaps,
@@ -294,21 +312,34 @@ def build(
         amounts=len(absorption.least),
         parameters=parameters,
         notes=(*notes, *grains.notes),
+        sizes=tuple(_sizes(scene, tables)),
     )
 
 
-def _memory(scene: Scene, tables: list[Table]) -> Memory:
-    """Return what level teleport-memory remembers, of nothing where there are no tables."""
+def _sizes(scene: Scene, tables: list[Table]) -> Iterator[InWords]:
+    """Return size and amount of the grains of each medium."""
+    at = 0
+    for medium in scene.media:
+        grains = [(table, grain.fraction) for grain, table in zip(medium.grains, tables[at:], strict=False)]
+        at += len(grains)
+        sizes = grain_sizes(grains, dict(medium.sizes).get(MATERIAL_DENSITY))
+        yield InWords(sizes, medium.packing_fraction, medium.radius, scene.metres_per_unit)
+
+
+def _memory(scene: Scene, tables: list[Table], chained: bool) -> Memory:
+    """Return what tables remember of entries and, where light goes from sphere to sphere in a chain, packings of their
+    neighbours; of nothing where there are no tables."""
     if not tables:
         return memory_of([], [], [], [])
     laws, grains, at = [], [], 0
     for number, medium in enumerate(scene.media, 1):
         own = tables[at : at + len(medium.grains)]
         at += len(own)
-        try:
-            laws.append(law(medium.packing_fraction))
-        except TSDFError as error:
-            raise SceneError(f"{scene.name}: {called('medium', number, medium.name)}: {error}") from None
+        if chained:
+            try:
+                laws.append(law(medium.packing_fraction))
+            except TSDFError as error:
+                raise SceneError(f"{scene.name}: {called('medium', number, medium.name)}: {error}") from None
         grains.append([(table, grain.fraction) for grain, table in zip(medium.grains, own, strict=True)])
     fractions = [medium.packing_fraction for medium in scene.media]
     return memory_of(laws, fractions, [medium.radius for medium in scene.media], grains)
@@ -440,6 +471,8 @@ def _lights(scene: Scene) -> tuple[LightArrays, list[str]]:
             environment *= light.scale
             rotation = light.rotation_deg
             notes += [f"{scene.name}: {note}" for note in said]
+        else:
+            assert_never(light)
     try:
         return compile_lights(constant, environment, rotation, suns), notes
     except TSDFError as error:

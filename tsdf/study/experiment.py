@@ -17,7 +17,8 @@ import numpy as np
 from tsdf.data.table import Table
 from tsdf.picture.render import SLOTS, Walkers
 from tsdf.picture.world import World, beam, build
-from tsdf.scene.scene import Absorption, Camera, ConstantLight, GrainSpec, MediumSpec, Scene, Slab, Sphere
+from tsdf.scene.scene import Absorption, Camera, ConstantLight, GrainSpec, MediumSpec, Render, Scene, Slab, Sphere
+from tsdf.spheres.around import around_of
 from tsdf.spheres.packing import cells_of, pack
 from tsdf.walk import transport as T
 from tsdf.walk import walker as W
@@ -91,35 +92,41 @@ class Passed(NamedTuple):
 # ----------------------------------------------------------------------------------------------- paths
 
 
-def _batch(world: World, camera: T.Camera, first: int, paths: int, seed: int, marks: int) -> tuple[np.ndarray, Ends]:
-    """Follow paths to their end, or past their limit of events so often; return as `follow` does."""
+def trips(
+    world: World, camera: T.Camera, first: int, paths: int, seed: int,
+    heard: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+    aim: Callable[[np.ndarray], None] = lambda new: None,
+) -> tuple[int, int, float]:  # fmt: skip
+    """Follow paths of a camera's first pixel, and tell of each whenever it has met as many grains as the world's limit
+    says, and when it ends; return grains met, what was drawn for that (single events and leaps), processor time [s].
+
+    Parameters
+    ----------
+    first : int
+        Number of the first path; paths of another number have other random numbers.
+    heard : callable
+        Given walkers, their amounts, and which of them could go on (n,) bool, it returns which of them do. `sample` is
+        a walker's number from `first` on.
+    aim : callable
+        May turn walkers that are about to start.
+    """
     mine = Walkers(world)
     began = time.thread_time()
     mine.reserve(paths)
-    job = T.Job(camera, 0, first + paths, 0, seed)
-    places = np.zeros((paths, marks, 3))
-    start, place, way = (np.zeros((paths, 3)) for _ in range(3))
-    weight, amounts = np.zeros(paths), np.zeros((paths, world.amounts))
-    passed = np.zeros(paths, np.int64)
+    job = T.Job(camera, 0, paths, first, seed)
     spawned, live = 0, 0
     while live or spawned < paths:
         if live <= SLOTS // 2 and spawned < paths:
             fresh = min(SLOTS - live, paths - spawned)
-            new = mine.walkers[0][live : live + fresh]
-            mine.spawn(live, job, first + spawned, fresh)
-            new["sample"] -= first
-            start[new["sample"]] = new["p"]
+            mine.spawn(live, job, spawned, fresh)
+            aim(mine.walkers[0][live : live + fresh])
             spawned, live = spawned + fresh, live + fresh
         before = live
         live = mine.turn(live)
         gone = np.flatnonzero(mine.walkers[1][:before]["sample"] < 0)
         those = mine.walkers[1][gone].copy()
-        number = ~those["sample"]
-        those["sample"] = number
-        places[number, passed[number]] = place[number] = those["p"]
-        way[number], weight[number], amounts[number] = those["d"], those["weight"], mine.amounts[1][gone]
-        passed[number] += 1
-        again = (passed[number] < marks) & (those["events"] >= world.media.limit) & (those["weight"] > 0.0)
+        those["sample"] = ~those["sample"]
+        again = heard(those, mine.amounts[1][gone], (those["events"] >= world.media.limit) & (those["weight"] > 0.0))
         more = int(again.sum())
         if more:
             those["events"], those["ray"] = 0, W.NONE
@@ -127,7 +134,27 @@ def _batch(world: World, camera: T.Camera, first: int, paths: int, seed: int, ma
             mine.amounts[0][live : live + more] = mine.amounts[1][gone][again]
             live += more
     events, seconds = int(mine.counters[W.EVENTS]), time.thread_time() - began
-    drawn = events - int(mine.counters[W.LEAPT]) + int(mine.counters[W.LEAPS])
+    return events, events - int(mine.counters[W.LEAPT]) + int(mine.counters[W.LEAPS]), seconds
+
+
+def _batch(world: World, camera: T.Camera, first: int, paths: int, seed: int, marks: int) -> tuple[np.ndarray, Ends]:
+    """Follow paths to their end, or past their limit of events so often; return as `follow` does."""
+    places = np.zeros((paths, marks, 3))
+    start, place, way = (np.zeros((paths, 3)) for _ in range(3))
+    weight, amounts = np.zeros(paths), np.zeros((paths, world.amounts))
+    passed = np.zeros(paths, np.int64)
+
+    def begin(new: np.ndarray) -> None:
+        start[new["sample"]] = new["p"]
+
+    def heard(those: np.ndarray, crossed: np.ndarray, able: np.ndarray) -> np.ndarray:
+        number = those["sample"]
+        places[number, passed[number]] = place[number] = those["p"]
+        way[number], weight[number], amounts[number] = those["d"], those["weight"], crossed
+        passed[number] += 1
+        return able & (passed[number] < marks)
+
+    events, drawn, seconds = trips(world, camera, first, paths, seed, heard, begin)
     return places, Ends(start, place, way, weight, amounts, events, drawn, seconds)
 
 
@@ -163,10 +190,9 @@ def follow(
         pool.shutdown(cancel_futures=True)
     ends = [one for _, one in found]
     start, place, way, weight, amounts = (np.concatenate([one[k] for one in ends]) for k in range(5))
-    events, drawn, taken = (sum(one.events for one in ends), sum(one.drawn for one in ends),
-                            sum(one.seconds for one in ends))  # fmt: skip
+    events, drawn = sum(one.events for one in ends), sum(one.drawn for one in ends)
     return np.concatenate([places for places, _ in found]), Ends(
-        start, place, way, weight, amounts, events, drawn, taken
+        start, place, way, weight, amounts, events, drawn, sum(one.seconds for one in ends)
     )
 
 
@@ -310,21 +336,24 @@ def _lower(world: World, fraction: float, packing: int, height: float) -> None:
     """Move the spheres of a packed world down, all the same."""
     made = pack(fraction, SPHERES, packing)
     moved = replace(made, centres=(made.centres - (0.0, 0.0, height)) % made.side)
-    arrays = world.packed.arrays
-    world.packed.arrays = arrays._replace(cells=(cells_of(moved),), centres=(np.ascontiguousarray(moved.centres),))
+    around = around_of(moved if world.media.traits.answered else None)
+    world.packed.arrays = world.packed.arrays._replace(
+        cells=(cells_of(moved),), centres=(np.ascontiguousarray(moved.centres),), around=(around,)
+    )
 
 
 def slab_experiment(
     level: str, grain: GrainSpec, fraction: float, layer: float, cosine: float = 1.0, packing: int = 0,
-    coefficients: Sequence[float] | None = None, top: float = 0.0, leap: float = 0.0,
+    coefficients: Sequence[float] | None = None, top: float = 0.0, leap: float = 0.0, singles: int = 0,
 ) -> Experiment:  # fmt: skip
     """Return what `slab` measures: reflectance, transmittance and profile one after the other, and so again for each of
     several absorption coefficients [1/R] if they are given, of the very same paths. The layer's
-    upper end is at height `top` of the tile."""
+    upper end is at height `top` of the tile; the first `singles` grains are met one by one."""
     if coefficients is not None:
         grain = replace(grain, absorption=Absorption("grey", (FAINTEST,)))
-    world = build(scene_of(Slab(-layer, 0.0), grain, fraction, packing), level, leap=leap)
-    if level == "explicit":
+    scene = replace(scene_of(Slab(-layer, 0.0), grain, fraction, packing), render=Render(explicit_grains=singles))
+    world = build(scene, level, leap=leap)
+    if world.media.singles:
         _lower(world, fraction, packing, top)
     way = np.array([math.sqrt(1.0 - cosine**2), 0.0, -cosine])
     high = 5.0 + WIDE  # the beam's tilted square begins above the slab
