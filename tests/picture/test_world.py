@@ -82,18 +82,18 @@ def heap(ball, radius, shape=CUBE, camera=None, absorption=0.0):
 
 
 def test_grains_too_small_for_their_medium_are_refused(ball):
-    """Grains of 1e-12 in a box of 4: a path would meet 1e12. Where they absorb, paths end, and the scene is built; from
-    1e5 grains on a note says how long it takes."""
+    """Grains of 1e-12 in a box of 4: a path without leaps would meet 1e12. Where they absorb, paths end, and the scene
+    is built; from 1e5 grains on a note says how long it takes."""
     for level in ("teleport", "volume-hg", "isotropic"):
         with pytest.raises(
             SceneError, match=r"heap: \[\[medium\]\] 1 \(heap\): light meets about .*take larger grains"
         ):
-            world.build(heap(ball, 1e-12), level)
+            world.build(heap(ball, 1e-12), level, leap=0.0)
     nameless = replace(heap(ball, 1e-12), media=(replace(heap(ball, 1e-12).media[0], name=""),))
     with pytest.raises(SceneError, match=r"heap: \[\[medium\]\] 1: light meets"):
-        world.build(nameless, "teleport")
+        world.build(nameless, "teleport", leap=0.0)
     assert not world.build(heap(ball, 1e-12, absorption=1e10), "teleport").notes
-    (note,) = world.build(heap(ball, 2e-6), "teleport").notes
+    (note,) = world.build(heap(ball, 2e-6), "teleport", leap=0.0).notes
     assert "light meets about 5e+05 grains" in note and "s of one thread" in note
     assert not world.build(heap(ball, 0.01), "teleport").notes
 

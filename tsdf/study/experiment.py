@@ -216,9 +216,9 @@ class Sums:
     total: np.ndarray | float = 0.0
     squares: np.ndarray | float = 0.0
     events: int = 0
-    drawn: int = 0
     seconds: float = 0.0
     lost: int = 0
+    drawn: int = 0
 
     def add(self, values: np.ndarray, ends: Ends) -> None:
         there = np.isfinite(values).all(axis=1)
