@@ -4,10 +4,10 @@ from pathlib import Path
 
 import click
 
-from tsdf.cli.common import Tool, check_folder, check_numbers, named_levels, plain, say, shown_progress
+from tsdf.cli.common import Tool, check_folder, check_numbers, named_levels, plain, say, working
 from tsdf.cli.start import interrupt_status, interrupted, interruptible
 
-MEASURED = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume")
+MEASURED = ("explicit", "teleport-packed", "teleport-memory", "teleport-joint", "teleport", "volume")
 
 
 @click.command("tsdf-accuracy", cls=Tool)
@@ -31,7 +31,9 @@ MEASURED = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume
     help="Time of measuring, after a start that makes packings and compiles once for this machine.  [default: 300]",
 )  # fmt: skip
 @click.option("--paths", type=int, metavar="N", help="Paths of each slab, level and packing instead.")
-@click.option("--packings", type=int, default=4, metavar="K", show_default=True, help="Packings behind explicit.")
+@click.option(
+    "--packings", type=int, default=4, metavar="K", show_default=True, help="Packings behind levels of packed grains."
+)
 @click.option("--seed", type=int, default=0, metavar="N", show_default=True, help="Of the random numbers, >= 0.")
 @click.option("--threads", type=int, metavar="N", help="[default: all processors]")
 @click.option("--quiet", is_flag=True, help="No progress bar, no table.")
@@ -56,26 +58,21 @@ def main(
     from tsdf.files import replacing
     from tsdf.scene.scene import GrainSpec
     from tsdf.study import accuracy, plots
+    from tsdf.walk.explicit import mesh_beside
 
     read = format.read(table)
+    mesh = mesh or mesh_beside(read, [table.parent])
     meshes = [] if mesh is None else [mesh]
     check_folder(out, ["accuracy.md", "accuracy.csv", "accuracy.png"], table, *meshes)
-    begun = False
-
-    def meaning() -> str | None:
-        return None if begun else "nothing is written"
-
-    with shown_progress(quiet) as progress, interruptible(meaning):
+    with working(quiet) as work:
 
         def told(share: float, word: str) -> None:
-            nonlocal begun
             if interrupted():  # the exception was lost on its way, in a callback say
                 raise KeyboardInterrupt
-            begun = begun or share > 0.0
-            progress(share, word)
+            work.told(share, word)
 
         try:
-            with interruptible(meaning, raises=True):
+            with interruptible(work.meaning, raises=True):
                 found = accuracy.measure(
                     GrainSpec(read, mesh=mesh), packing, layer, chosen, packings, seconds, paths, seed, threads, told,
                     plain(table.name),

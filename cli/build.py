@@ -15,6 +15,9 @@ from tsdf.errors import GrainError, TSDFError, UsageError
 
 if TYPE_CHECKING:
     from tsdf.data.table import Table
+    from tsdf.grain.grains import Grain
+    from tsdf.grain.optics import Optics
+    from tsdf.make.scatterometer import Build
     from tsdf.make.scatterometer import Progress as Done
 
 LONG_S = 600.0  # [s] what takes longer deserves a note
@@ -167,7 +170,7 @@ def told(progress: Progress, target: float | None) -> Callable[["Done"], None]:
     callback=_list_grains,
     help="List the built-in grains and their parameters.",
 )
-def main(
+def main(  # noqa: PLR0913 - an argument for each option
     grain: str,
     out: Path,
     settings: dict[str, str],
@@ -192,37 +195,26 @@ def main(
     quiet: bool,
 ) -> int:
     """Build the table of GRAIN: "sphere", a built-in grain (see --grains), or a mesh file."""
-    if eta is not None and material is not None:
-        raise UsageError("give --eta or --material, not both")
-    if eta is not None and wavelength_nm is not None:
-        raise UsageError("--wavelength-nm goes with --material, not with --eta")
-    check_numbers(threads=threads)
-    if traced and grain != "sphere":
-        raise UsageError("--traced is for the exact sphere; every other grain is traced anyway")
     exact = grain == "sphere" and not traced
-    if exact and (part is not None or resume or paths is not None or max_seconds is not None):
-        raise UsageError("the exact sphere takes no paths, chunks, seconds or resuming; add --traced to trace it")
-    if part is not None and target_error is not None:
-        raise UsageError("parts cannot know when the whole meets a target: give --paths with --chunk")
-    if (repair or repair_any) and grain == "sphere":
-        raise UsageError("--repair is for mesh files")
+    some = part is not None or resume or paths is not None or max_seconds is not None
+    check_numbers(threads=threads)
+    for contradiction, text in (
+        (eta is not None and material is not None, "give --eta or --material, not both"),
+        (eta is not None and wavelength_nm is not None, "--wavelength-nm goes with --material, not with --eta"),
+        (traced and grain != "sphere", "--traced is for the exact sphere; every other grain is traced anyway"),
+        (exact and some, "the exact sphere takes no paths, chunks, seconds or resuming; add --traced to trace it"),
+        (
+            part is not None and target_error is not None,
+            "parts cannot know when the whole meets a target: give --paths with --chunk",
+        ),
+        ((repair or repair_any) and grain == "sphere", "--repair is for mesh files"),
+    ):
+        if contradiction:
+            raise UsageError(text)
 
-    from tsdf.grain.optics import Optics
     from tsdf.make import scatterometer
 
-    if eta is None:
-        from tsdf.grain.constants import constants_of
-
-        found = constants_of(
-            material or DEFAULT_MATERIAL, DEFAULT_WAVELENGTH_NM if wavelength_nm is None else wavelength_nm
-        )
-        optics = Optics(found.n, fresnel, found.material, found.wavelength_nm, found.k, found.source)
-        if found.k is not None and found.k > 0.01 and not quiet:
-            click.echo(
-                f"note: k is {found.k:.2g}: the reflectance of so dark a surface is taken as if k were 0", err=True
-            )
-    else:
-        optics = Optics(eta, fresnel)
+    optics = optics_of(eta, material, wavelength_nm, fresnel, quiet)
     effort = scatterometer.Effort(paths, target_error, cells, joint, seed, max_bounces, memory)
     part_file = out if part is not None else out.with_name(out.name + ".part")
     inputs = [Path(grain), *([Path(material)] if material else [])]
@@ -235,23 +227,94 @@ def main(
     from tsdf.grain.grains import load_grain
 
     shape = load_grain(grain, repair="any" if repair_any else repair, **settings)
-    if not quiet:
-        for note in shape.notes:
-            click.echo(f"note: {note}", err=True)
+    for text in shape.notes:
+        note(text, quiet)
     if exact:
         finish(scatterometer.exact_sphere(shape, optics, effort), out, quiet)
         return 0
 
     build = scatterometer.Build.start(shape, optics, effort)
-    if resume and not part_file.exists():
+    if resume:
+        go_on(build, part_file, paths, max_seconds, quiet)
+    try:
+        table = trace(
+            build, shape, part, part_file, target_error, max_seconds, threads or os.cpu_count() or 1, quiet
+        )  # fmt: skip
+    except KeyboardInterrupt:
+        click.echo(
+            f"tsdf-build: error: interrupted: {build.paths} paths are safe in {plain(part_file)}; go on with --resume, "
+            "or with --resume --max-seconds 0 for the table as good as it got",
+            err=True,
+        )
+        return interrupt_status()
+    short = build.falls_short(part or (1, 1))
+    if table is not None:
+        finish(table, out, quiet, None if short else part_file)
+    elif part is not None and not quiet:
+        say(f"{plain(out)}: part {part[0]} of {part[1]}, {build.paths} paths; tsdf-merge makes the table")
+    if short:
+        note(f"{short}; {plain(part_file)} is kept: --resume goes on")
+    return 0
+
+
+def note(text: str, quiet: bool = False) -> None:
+    """Say on standard error what is worth knowing."""
+    if not quiet:
+        click.echo(f"note: {text}", err=True)
+
+
+def optics_of(
+    eta: float | None, material: str | None, wavelength_nm: float | None, fresnel: str, quiet: bool
+) -> "Optics":
+    """Return the optics of a grain of this index, or else of this material."""
+    from tsdf.grain.optics import Optics
+
+    if eta is not None:
+        return Optics(eta, fresnel)
+
+    from tsdf.grain.constants import constants_of
+
+    found = constants_of(
+        material or DEFAULT_MATERIAL, DEFAULT_WAVELENGTH_NM if wavelength_nm is None else wavelength_nm
+    )
+    optics = Optics(found.n, fresnel, found.material, found.wavelength_nm, found.k, found.source)
+    if found.k is not None and found.k > 0.01:
+        note(f"k is {found.k:.2g}: the reflectance of so dark a surface is taken as if k were 0", quiet)
+    return optics
+
+
+def go_on(build: "Build", part_file: Path, paths: int | None, max_seconds: float | None, quiet: bool) -> None:
+    """Let a build begin with the paths of a part file, as --resume says, if there is one."""
+    from tsdf.make import scatterometer
+
+    if not part_file.exists():
         if max_seconds == 0.0:
             raise TSDFError(f"{plain(part_file)} is not there: there are no paths to make a table of")
-        if not quiet:
-            click.echo(f"note: {plain(part_file)} is not there: the build begins anew", err=True)
-    if resume and part_file.exists():
-        build.take(scatterometer.Build.load(part_file), plain(part_file))
-        if not quiet and build.paths > (paths or build.paths):
-            click.echo(f"note: {plain(part_file)} holds {build.paths} paths already, and all are used", err=True)
+        note(f"{plain(part_file)} is not there: the build begins anew", quiet)
+        return
+    build.take(scatterometer.Build.load(part_file), plain(part_file))
+    if build.paths > (paths or build.paths):
+        note(f"{plain(part_file)} holds {build.paths} paths already, and all are used", quiet)
+
+
+def trace(
+    build: "Build",
+    shape: "Grain",
+    part: tuple[int, int] | None,
+    part_file: Path,
+    target_error: float | None,
+    max_seconds: float | None,
+    threads: int,
+    quiet: bool,
+) -> "Table | None":
+    """Trace a grain, or one part of what is to be traced of it, and return the table, None of a part.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        Once the paths are in the part file.
+    TSDFError
+    """
 
     def meaning() -> str | None:
         return None if build.done else "nothing is done yet"
@@ -260,18 +323,10 @@ def main(
         with interruptible(meaning, raises=True):
             with shown_progress(quiet) as progress:
                 build.run(
-                    shape, threads or os.cpu_count() or 1, part or (1, 1), part_file,
-                    None if quiet else told(progress, target_error),
+                    shape, threads, part or (1, 1), part_file, None if quiet else told(progress, target_error),
                     max_seconds=math.inf if max_seconds is None else max_seconds,
                 )  # fmt: skip
-            table = build.table(as_it_got=max_seconds is not None) if part is None else None
-    except KeyboardInterrupt:
-        click.echo(
-            f"tsdf-build: error: interrupted: {build.paths} paths are safe in {plain(part_file)}; go on with --resume, "
-            "or with --resume --max-seconds 0 for the table as good as it got",
-            err=True,
-        )
-        return interrupt_status()
+            return build.table(as_it_got=max_seconds is not None) if part is None else None
     except GrainError:
         part_file.unlink(missing_ok=True)  # a refused grain cannot be gone on with
         raise
@@ -280,14 +335,6 @@ def main(
             f"{error}; its {build.paths} paths are kept in {plain(part_file)}: --resume goes on with them, "
             "--resume --max-seconds 0 makes the table as good as it got"
         ) from None
-    short = build.falls_short(part or (1, 1))
-    if table is not None:
-        finish(table, out, quiet, None if short else part_file)
-    elif part is not None and not quiet:
-        say(f"{plain(out)}: part {part[0]} of {part[1]}, {build.paths} paths; tsdf-merge makes the table")
-    if short:
-        click.echo(f"note: {short}; {plain(part_file)} is kept: --resume goes on", err=True)
-    return 0
 
 
 def finish(table: "Table", out: Path, quiet: bool, part_file: Path | None = None) -> None:

@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 import click
 
 from tsdf.cli import start
-from tsdf.cli.start import answer, interrupt_status
+from tsdf.cli.start import answer, interrupt_status, interruptible
 from tsdf.errors import TSDFError, UsageError
 from tsdf.scene import levels
 
@@ -249,6 +249,42 @@ def shown_progress(quiet: bool) -> Iterator[Progress]:
         done.set()
         ticking.join()
         progress.close()
+
+
+class Work:
+    """What a command is at: its progress, whether there is something to keep, and the word to stop.
+
+    Attributes
+    ----------
+    progress : Progress
+    begun : bool
+        Whether an interrupt leaves something to write: then it sets `stop`, else it ends the process.
+    stop : Event
+    """
+
+    def __init__(self, progress: Progress) -> None:
+        self.progress, self.begun, self.stop = progress, False, threading.Event()
+
+    def told(self, share: float, word: str) -> None:
+        """Show progress; from the first share above 0 on there is something to keep."""
+        self.begun = self.begun or share > 0.0
+        self.progress(share, word)
+
+    def meaning(self) -> str | None:
+        """Say what an interrupt means, see `start.interruptible`."""
+        if not self.begun:
+            return "nothing is written"
+        self.stop.set()
+        return None
+
+
+@contextlib.contextmanager
+def working(quiet: bool) -> Iterator[Work]:
+    """Show progress and answer interrupts while this runs, by what has been begun."""
+    with shown_progress(quiet) as progress:
+        work = Work(progress)
+        with interruptible(work.meaning):
+            yield work
 
 
 # --- options ------------------------------------------------------------------------

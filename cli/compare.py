@@ -1,14 +1,13 @@
 """``tsdf-compare``: a scene in, the error and the time of every level out."""
 
-import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from tsdf.cli.common import LEVELS, Tool, check_folder, check_numbers, named_levels, plain, say, shown_progress
+from tsdf.cli.common import LEVELS, Tool, check_folder, check_numbers, named_levels, plain, say, working
 from tsdf.cli.render import save
-from tsdf.cli.start import interrupt_status, interruptible
+from tsdf.cli.start import interrupt_status
 
 if TYPE_CHECKING:
     from tsdf.picture.render import Picture
@@ -54,27 +53,14 @@ def main(
     read = resized(load(scene), width)
     pictures = [f"{name}{suffix}" for name in (*LEVELS, "reference") for suffix in (".exr", ".png")]
     check_folder(out, ["levels.md", "levels.csv", "levels.png", *pictures], scene, *files_of(read))
-    stop, begun = threading.Event(), False
-
-    def interrupted() -> str | None:
-        if not begun:
-            return "nothing is written"
-        stop.set()
-        return None
 
     def keep(name: str, world: "World", picture: "Picture", own: int) -> None:
         save(world, picture, own, out / f"{name}.exr")
 
-    with shown_progress(quiet) as progress, interruptible(interrupted):
-
-        def told(share: float, word: str) -> None:
-            nonlocal begun
-            begun = begun or share > 0.0
-            progress(share, word)
-
+    with working(quiet) as work:
         found = compare.compare(
             read, chosen, spp, seconds, reference_seconds, packings, read.render.seed if seed is None else seed,
-            threads, told, keep, stop,
+            threads, work.told, keep, work.stop,
         )  # fmt: skip
         for name, text in (("levels.md", compare.markdown(found)), ("levels.csv", compare.csv_text(found))):
             with replacing(out / name) as temporary:

@@ -71,7 +71,8 @@ def describe(table: "Table", absorption_times_radius: float = 0.0, radius: float
     With absorption (sigma_a R), `albedo` and `mean_cosine` are those of the absorbing grain. Their standard errors are
     unknown.
     """
-    from tsdf.data.table import CONDITIONALS, thawed
+    from tsdf.data.blocks import CONDITIONALS
+    from tsdf.data.table import thawed
 
     header = thawed(table.header)
     grain, optics, made = header["grain"], header["optics"], header["provenance"]

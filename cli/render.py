@@ -1,14 +1,14 @@
 """``tsdf-render``: a scene in, a picture out."""
 
 import json
-import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from tsdf.cli.common import LEVELS, Tool, check_numbers, check_output, plain, say, shown_progress
-from tsdf.cli.start import interrupt_status, interruptible
+from tsdf.cli.common import LEVELS, Tool, check_numbers, check_output, plain, say, working
+from tsdf.cli.start import interrupt_status
 
 if TYPE_CHECKING:
     from tsdf.picture.render import Picture
@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     help="Picture to write, NAME.exr (linear RGB and the variance of each pixel); NAME.png is written beside it.",
 )  # fmt: skip
 @click.option("--level", type=click.Choice(LEVELS), help="How grains are modelled.  [default: the scene's]")
+@click.option(
+    "--explicit-grains", type=int, metavar="K",
+    help="Follow the first K grains from the camera one by one, then as the level does.  [default: the scene's]",
+)  # fmt: skip
 @click.option("--spp", type=int, metavar="N", help="Samples per pixel.  [default: the scene's]")
 @click.option("--seconds", type=float, metavar="S", help="Stop after S seconds instead.")
 @click.option(
@@ -30,11 +34,17 @@ if TYPE_CHECKING:
 )  # fmt: skip
 @click.option("--seed", type=int, metavar="N", help="Of the random numbers, >= 0.  [default: the scene's]")
 @click.option("--width", type=int, metavar="PIXELS", help="Width of the picture; its shape is kept.")
+@click.option(
+    "--leap", type=float, metavar="G",
+    help="Take many events in one step where nothing is nearer than G transport mean free paths; 0 never does.  "
+    "[default: the scene's, else 2]",
+)  # fmt: skip
 @click.option("--threads", type=int, metavar="N", help="[default: all processors]")
 @click.option("--quiet", is_flag=True, help="No progress bar, no summary.")
 def main(
-    scene: Path, out: Path, level: str | None, spp: int | None, seconds: float | None, target_error: float | None,
-    seed: int | None, width: int | None, threads: int | None, quiet: bool,
+    scene: Path, out: Path, level: str | None, explicit_grains: int | None, spp: int | None, seconds: float | None,
+    target_error: float | None, seed: int | None, width: int | None, leap: float | None, threads: int | None,
+    quiet: bool,
 ) -> int:  # fmt: skip
     """Render the picture of SCENE, a TOML file.
 
@@ -47,43 +57,41 @@ def main(
     if out.suffix.lower() != ".exr":
         raise UsageError(f"--out {plain(out)}: is to end in .exr")
     check_numbers(seed, spp=spp, width=width, threads=threads)
+    if explicit_grains is not None and explicit_grains < 0:
+        raise UsageError(f"--explicit-grains is a whole number, 0 for none, not {explicit_grains}")
     for name, limit in (("--seconds", seconds), ("--target-error", target_error)):
         if limit is not None and not 0.0 < limit < float("inf"):
             raise UsageError(f"{name} is a finite number above 0, not {limit:g}")
     if sum(stop is not None for stop in (spp, seconds, target_error)) > 1:
         raise UsageError("--spp, --seconds and --target-error each say when to stop: give one")
 
-    from tsdf.picture import image, render, world
-    from tsdf.scene.scene import files_of, load, resized
+    from tsdf.picture import image, leaping, render, world
+    from tsdf.scene.scene import MAX_EXPLICIT, files_of, load, resized
 
+    if leap is not None:
+        leaping.checked(leap, "--leap")
     read = resized(load(scene), width)
+    if explicit_grains is not None:
+        most = min(explicit_grains, MAX_EXPLICIT)  # no path meets so many
+        read = replace(read, render=replace(read.render, explicit_grains=most))
     check_output(out, scene, *files_of(read), beside=[out.with_suffix(".png")])
     if spp is None and seconds is None and target_error is None:
         spp = read.render.spp
     seed = read.render.seed if seed is None else seed
 
-    stop, begun = threading.Event(), False
-
-    def interrupted() -> str | None:
-        if not begun:
-            return "nothing is written"
-        stop.set()
-        return None
-
-    with shown_progress(quiet) as progress, interruptible(interrupted):
+    with working(quiet) as work:
 
         def told(share: float, word: str) -> None:
-            nonlocal begun
-            begun = True
-            progress(share, word)
+            work.begun = True  # samples that a picture can be made of
+            work.told(share, word)
 
-        progress(0.0, "reading the scene")
-        made = world.build(read, level or read.render.level)
+        work.told(0.0, "reading the scene")
+        made = world.build(read, level or read.render.level, leap=leap, progress=work.told)
         for note in made.notes:
-            progress.note(note)
+            work.progress.note(note)
         image.prepare()
-        progress(0.0, "starting")
-        picture = render.render(made, spp, seconds, target_error, seed, threads, told, stop)
+        work.told(0.0, "starting")
+        picture = render.render(made, spp, seconds, target_error, seed, threads, told, work.stop)
         if not picture.samples.any():
             click.echo("interrupted before the first sample: nothing is written", err=True)
             return interrupt_status()
@@ -104,10 +112,15 @@ def save(world: "World", picture: "Picture", seed: int, out: Path) -> None:
         "samples": [int(picture.samples.min()), int(picture.samples.max())],
         "seed": seed,
         "events": picture.events,
+        "leap": world.leap,
+        "leapt": picture.leapt,
+        "leaps": picture.leaps,
         "truncated": picture.truncated,
         "faults": picture.faults,
         "software": estimate.software(),
     }
+    if singles := world.scene.render.explicit_grains:
+        facts["explicit_grains"] = singles
     image.write_exr(out, picture.rgb, picture.variance, {"tsdf_render": json.dumps(facts)})
     image.write_png(out.with_suffix(".png"), picture.rgb, world.scene.camera.exposure)
 
@@ -116,9 +129,11 @@ def summary(world: "World", picture: "Picture", out: Path) -> None:
     """Say on standard output what the picture holds."""
     low, high = int(picture.samples.min()), int(picture.samples.max())
     held = f"{low}" if low == high else f"{low} to {high}"
+    singles = world.scene.render.explicit_grains
+    after = f" after {singles} explicit grains" if singles else ""
     state = "interrupted: holds" if picture.interrupted else "holds"
     say(
-        f"{plain(out)}: {state} {held} samples per pixel, level {world.level}, relative error "
+        f"{plain(out)}: {state} {held} samples per pixel, level {world.level}{after}, relative error "
         f"{picture.relative_error:.2g}, {picture.seconds:.1f} s, {picture.events / max(picture.seconds, 1e-9):.3g} "
         "grain events per second"
     )

@@ -24,7 +24,8 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from tsdf.data.table import CONDITIONALS, Table, thawed
+from tsdf.data.blocks import CONDITIONALS
+from tsdf.data.table import Table, thawed
 from tsdf.errors import UsageError
 from tsdf.files import replacing
 from tsdf.picture import image

@@ -775,8 +775,10 @@ def _offset(g: Any, c: Any, column: Any, d: Any, side: Any, sampler: Any) -> Any
 
 
 @dr.syntax
-def _open(k: Any, scene: Any, p: Any, d: Any, distance: Any, m: Any, jump: Any, e: Any, size: Any, length: Any,
-          c: Any, sampler: Any, active: Any) -> Any:  # fmt: skip
+def _open(  # noqa: PLR0913 - what a vectorised ray knows, each an argument
+    k: Any, scene: Any, p: Any, d: Any, distance: Any, m: Any, jump: Any, e: Any, size: Any, length: Any,
+    c: Any, sampler: Any, active: Any,
+) -> Any:  # fmt: skip
     """Return how much light comes from a distance along d to p in medium m; first of all by a jump along e."""
     p, d, m, jump = mi.Point3f(p), mi.Vector3f(d), mi.Int32(m), mi.Bool(jump)
     distance, active = mi.Float(distance), mi.Bool(active)
@@ -836,7 +838,9 @@ def _light(k: Any, scene: Any, p: Any, count: int, sampler: Any) -> Any:
 
 
 @dr.syntax
-def trace(self: Any, k: Any, scene: Any, sampler: Any, ray: Any, medium: Any, active: Any) -> Any:
+def trace(  # noqa: C901 - Dr.Jit reads the loop of light and all its branches in one function
+    self: Any, k: Any, scene: Any, sampler: Any, ray: Any, medium: Any, active: Any
+) -> Any:
     """Return the radiance that arrives along rays, whether they met anything, and how many grains."""
     p, d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
     active = mi.Bool(active)

@@ -2,8 +2,8 @@
 //
 // The reader follows schema/SPEC.md and checks every rule of it; the inflate, SHA-256 and JSON it needs are in here.
 // Sampling is Algorithm 1 of Meng et al. 2015 (doi 10.1145/2766949) by exact inversion of cumulative masses with guide
-// tables (Chen & Asau 1974): the same random numbers give the same events as tsdf.sampler in Python. Nothing here throws
-// of itself, nothing allocates once `Sampler::prepare` is done, and a const Sampler serves any number of threads.
+// tables (Chen & Asau 1974): the same random numbers give the same events as tsdf.data.sampler in Python. Nothing here
+// throws of itself, nothing allocates once `Sampler::prepare` is done, and a const Sampler serves any number of threads.
 // Lengths are in units of R, the radius of the bounding sphere, angles in radians. Buffers and a shader: docs/cpp.md.
 // Licence: MIT.
 #ifndef TSDF_HPP
@@ -766,10 +766,19 @@ constexpr double inf = std::numeric_limits<double>::infinity();
 constexpr double largest = 1e30;                        // magnitude of any number but integers
 constexpr double slack = 1e-9, upmost = 1.000000001;    // statistics are sums of many numbers, and rounded
 constexpr double below_one = 0x1.fffffffffffffp-1;
-// Joint records begin after the blocks that are required; what is new in 1.1, records by entry, after those.
-constexpr int block_names = 20, required_blocks = 6, old_blocks = 12;
 
 // The blocks of version 1.1 in their order.
+namespace which {
+enum : int {
+    p_theta, p_phi, p_r, p_z, p_l, mean_l,
+    joint_r, joint_z, joint_phi_delta, joint_l, joint_entry_b2, joint_entry_azimuth,
+    memory_hit, memory_cos_theta, memory_entry_azimuth, memory_r, memory_z, memory_phi_delta, memory_l, memory_entry_b2,
+    count
+};
+}  // namespace which
+// Joint records begin after the blocks that are required; what is new in 1.1, records by entry, after those.
+constexpr int block_names = which::count, required_blocks = which::joint_r, old_blocks = which::memory_hit;
+
 inline const char* block_name(int i) noexcept {
     static constexpr const char* names[block_names] = {
         "p_theta", "p_phi",   "p_r",             "p_z",     "p_l",            "mean_l",
@@ -1167,7 +1176,7 @@ class Reader {
             order.push_back(k);
             block(k).first_row = first;
             block(k).rows = rows;
-            if (const Value* edges = k > 0 && k < 5 ? blocks[i].find("edges") : nullptr)
+            if (const Value* edges = k >= which::p_phi && k <= which::p_l ? blocks[i].find("edges") : nullptr)
                 for (const Value& edge : edges->items) block(k).edges.push_back(edge.number);
         }
         if (next != table.rows)
@@ -1198,17 +1207,18 @@ class Reader {
             return false;
         for (std::size_t i = 0; i < blocks.size(); ++i) {
             const int k = known(blocks[i].find("name")->text);
-            if (k < 1 || k > 4) continue;
+            if (k < which::p_phi || k > which::p_l) continue;
             const std::string place = "/blocks/" + std::to_string(i) + "/edges";
             const std::vector<double>& edges = block(k).edges;
             if (edges.size() != block(k).rows + 1)
                 return fail("MANIFEST_EDGE_COUNT", "not one edge more than rows", place);
             const double first = edges.front(), last = edges.back();
-            const bool whole = k == 1   ? -pi <= first && first <= 0.0 && std::abs(last - first - 2.0 * pi) <= 1e-9
-                               : k == 2 ? first == 0.0 && last == 2.0
-                               : k == 3 ? first == -1.0 && last == 2.0
-                                        : first == 0.0;
-            if (!axis(edges, place, whole, k == 4, false)) return false;
+            const bool whole =
+                k == which::p_phi ? -pi <= first && first <= 0.0 && std::abs(last - first - 2.0 * pi) <= 1e-9
+                : k == which::p_r ? first == 0.0 && last == 2.0
+                : k == which::p_z ? first == -1.0 && last == 2.0
+                                  : first == 0.0;
+            if (!axis(edges, place, whole, k == which::p_l, false)) return false;
         }
         return true;
     }
@@ -1291,7 +1301,7 @@ class Reader {
         for (size_t x = 0; x < table.columns; ++x) sum += double(drawn[x]);
         if (std::abs(sum - 1.0) > 1e-5)
             return fail("VALUE_P_THETA_SUM", "p_theta does not sum to 1", "row 0, column 0");
-        for (int k = 1; k < 5; ++k) {
+        for (int k = which::p_phi; k <= which::p_l; ++k) {
             std::vector<double> sums(table.columns, 0.0);
             for (size_t y = 0; y < block(k).rows; ++y)
                 for (size_t x = 0; x < table.columns; ++x) sums[x] += double(table.row(block(k).first_row + y)[x]);
@@ -1309,11 +1319,11 @@ class Reader {
             const double mean = double(value), upper = y + 1 < table.p_l.rows ? table.p_l.edges[y + 1] : largest;
             return mean * (1.0 + 1e-6) < table.p_l.edges[y] || mean * (1.0 - 1e-6) > upper;
         };
-        if (!sound(5, "VALUE_MEAN_RANGE", "outside its cell or of no mass", outside)) return false;
-        // Blocks of the joint records, and of the records by entry: r, z, phi_delta, entry_b2, entry_azimuth
-        static constexpr int of_joint[] = {6, 7, 8, 10, 11}, of_memory[] = {15, 16, 17, 19, 14};
-        return (table.records == 0 || records(required_blocks, old_blocks, of_joint)) &&
-               (table.memory_records == 0 || memory(of_memory)) && means();
+        if (!sound(which::mean_l, "VALUE_MEAN_RANGE", "outside its cell or of no mass", outside)) return false;
+        const Fields joint{which::joint_r, which::joint_z, which::joint_phi_delta, which::joint_entry_b2,
+                           which::joint_entry_azimuth};
+        return (table.records == 0 || records(required_blocks, old_blocks, joint)) &&
+               (table.memory_records == 0 || memory()) && means();
     }
 
     // Whether the statistics are those that the masses of the cells allow, whatever lies where in a cell.
@@ -1357,51 +1367,71 @@ class Reader {
                near("mean_path_length", s.mean_path_length, length, length, (std::max)(1.0, length));
     }
 
-    bool memory(const int (&of_memory)[5]) {
+    // Blocks that hold the fields of records of one kind.
+    struct Fields {
+        int r, z, phi_delta, entry_b2, entry_azimuth;
+    };
+
+    bool memory() {
         using std::size_t;
         const auto unlikely = [](size_t, size_t, float v) { return v < 0.0f || v > 1.0f; };
-        if (!sound(old_blocks, "VALUE_MEMORY_HIT", "not a probability", unlikely) ||
-            !records(old_blocks + 1, block_names, of_memory))
+        const Fields fields{which::memory_r, which::memory_z, which::memory_phi_delta, which::memory_entry_b2,
+                            which::memory_entry_azimuth};
+        if (!sound(which::memory_hit, "VALUE_MEMORY_HIT", "not a probability", unlikely) ||
+            !records(which::memory_hit + 1, block_names, fields))
             return false;
         const float* hit = table.row(table.memory_hit.first_row);
         const auto strays = [&](size_t, size_t x, float v) {
             const double low = double(x) / double(table.columns), high = low + 1.0 / double(table.columns);
             return hit[x] != 0.0f && (double(v) < low - 1e-6 || double(v) > high + 1e-6);
         };
-        if (!sound(of_memory[3], "VALUE_MEMORY_CELL", "not of this column's cell", strays)) return false;
+        if (!sound(which::memory_entry_b2, "VALUE_MEMORY_CELL", "not of this column's cell", strays)) return false;
         const auto filled = [&](size_t, size_t x, float v) { return hit[x] == 0.0f && v != 0.0f; };
         for (int k = old_blocks + 1; k < block_names; ++k)
             if (!sound(k, "VALUE_MEMORY_EMPTY", "not 0 though memory_hit is", filled)) return false;
         return true;
     }
 
-    // Rules of the records in the blocks from `first` to before `end`; `of` as in `values`.
-    bool records(int first, int end, const int (&of)[5]) {
-        using std::size_t;
+    // Least and largest value of a block of records.
+    static std::pair<double, double> range(int k) noexcept {
         constexpr double turn = double(3.14159274f);  // pi as float32
-        static constexpr double low[] = {0, -1, -turn, 0, 0, -turn, 0,  // joint records, memory_hit,
-                                         -1, -turn, 0, -1, -turn, 0, 0};  // records by entry
-        static constexpr double high[] = {2, 2, turn, largest, 1, turn, 1, 1, turn, 2, 2, turn, largest, 1};
+        switch (k) {
+            case which::joint_r: case which::memory_r: return {0.0, 2.0};
+            case which::joint_z: case which::memory_z: return {-1.0, 2.0};
+            case which::joint_phi_delta: case which::memory_phi_delta: return {-turn, turn};
+            case which::joint_entry_azimuth: case which::memory_entry_azimuth: return {-turn, turn};
+            case which::joint_l: case which::memory_l: return {0.0, largest};
+            case which::memory_cos_theta: return {-1.0, 1.0};
+            default: return {0.0, 1.0};  // entry_b2
+        }
+    }
+
+    // Rules of the records in the blocks from `first` to before `end`.
+    bool records(int first, int end, const Fields& of) {
+        using std::size_t;
         for (int k = first; k < end; ++k) {
-            const int i = k - required_blocks;
+            const std::pair<double, double> allowed = range(k);
+            const bool azimuth = k == which::joint_entry_azimuth;
             const auto outside = [&](size_t, size_t x, float v) {
-                return double(v) < low[i] - 1e-6 || double(v) > high[i] + 1e-6 ||
-                       (i == 5 && v != 0.0f && (x == 0 || x + 1 == table.columns));
+                return double(v) < allowed.first - 1e-6 || double(v) > allowed.second + 1e-6 ||
+                       (azimuth && v != 0.0f && (x == 0 || x + 1 == table.columns));
             };
             if (!sound(k, "VALUE_RECORD_RANGE", "out of range", outside)) return false;
         }
         const auto value = [&](int k, size_t y, size_t x) { return double(table.row(block(k).first_row + y)[x]); };
-        const auto falls = [&](size_t y, size_t x, float v) { return y > 0 && double(v) < value(of[3], y - 1, x); };
-        if (!sound(of[3], "VALUE_RECORD_ORDER", "smaller than the one before", falls)) return false;
+        const auto falls = [&](size_t y, size_t x, float v) {
+            return y > 0 && double(v) < value(of.entry_b2, y - 1, x);
+        };
+        if (!sound(of.entry_b2, "VALUE_RECORD_ORDER", "smaller than the one before", falls)) return false;
         // With d_in along z and x_i at azimuth 0, phi_d is entry_azimuth and phi_p is phi_delta + phi_d
         const auto off = [&](size_t y, size_t x, float v) {
-            const double r = double(v), z = value(of[1], y, x);
-            const double b2 = (std::min)((std::max)(value(of[3], y, x), 0.0), 1.0);
-            const double phi_p = value(of[2], y, x) + value(of[4], y, x);
+            const double r = double(v), z = value(of.z, y, x);
+            const double b2 = (std::min)((std::max)(value(of.entry_b2, y, x), 0.0), 1.0);
+            const double phi_p = value(of.phi_delta, y, x) + value(of.entry_azimuth, y, x);
             return std::abs(r * r + 2.0 * r * std::sqrt(b2) * std::cos(phi_p) + z * z - 2.0 * z * std::sqrt(1.0 - b2)) >
                    2e-3;
         };
-        return sound(of[0], "VALUE_RECORD_SPHERE", "the exit is off the bounding sphere", off);
+        return sound(of.r, "VALUE_RECORD_SPHERE", "the exit is off the bounding sphere", off);
     }
 
     const std::uint8_t* data;

@@ -195,6 +195,7 @@ def checks() -> dict[str, bytes]:
     edit("PHYSICS_HIT_PROBABILITY", "cube", put("grain/area", two_percent))
     edit("PHYSICS_CHORD", "cube", put("statistics/mean_miss_chord", 0.0))
     edit("PHYSICS_PATH_LENGTH", "cube", put("grain/volume", lambda volume: 0.9 * volume))
+    edit("PHYSICS_PATH_LENGTH-short", "cube", put("grain/volume", two_percent))
     edit("PHYSICS_PATH_LENGTH-identity", "cube_identity", put("grain/volume", two_percent))
     edit("PHYSICS_IDENTITY", "cube_identity", put("statistics/mean_z", two_percent))
     return made

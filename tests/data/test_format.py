@@ -20,7 +20,8 @@ import pytest
 import tsdf
 from tsdf.data import container
 from tsdf.data import format as fmt
-from tsdf.data.table import MEMORY_FIELDS, Table, thawed
+from tsdf.data.blocks import MEMORY_FIELDS
+from tsdf.data.table import Table, thawed
 from tsdf.errors import FormatError, FormatWarning, TSDFError
 from tsdf.reference_data import make_golden
 

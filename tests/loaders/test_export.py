@@ -23,7 +23,8 @@ from click.testing import CliRunner, Result
 
 import tsdf
 from tsdf.cli import export as cli
-from tsdf.data.table import CONDITIONALS, Table
+from tsdf.data.blocks import CONDITIONALS
+from tsdf.data.table import Table
 from tsdf.errors import FormatWarning
 from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tsdf.data.blocks import MEMORY_FIELDS
 from tsdf.grain.grains import Grain, embree_scene, first_hit, grain_from_mesh, load_grain
 from tsdf.grain.horizon import horizon_of
 from tsdf.judge import analytic
@@ -294,7 +295,7 @@ def test_records_by_entry_of_a_sphere() -> None:
     for eta in (1.33, 1.40):
         truth = by_entry(eta, columns)
         z = []
-        for name, values in zip(estimate.MEMORY_FIELDS, records, strict=True):
+        for name, values in zip(MEMORY_FIELDS, records, strict=True):
             if name in truth:
                 error = np.maximum(values.std(axis=0, ddof=1) / math.sqrt(count), 1e-3)
                 z.append((values.mean(axis=0) - truth[name]) / error)

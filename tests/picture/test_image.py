@@ -41,7 +41,7 @@ def written(path, channels, **header):
 def test_colour_science_changes_nothing_else() -> None:
     """Its import sets numpy's way of printing, on which other people's output and our golden files depend."""
     code = (
-        "import numpy as np; before = np.get_printoptions(); from tsdf import image; image.spectral_weights(); "
+        "import numpy as np; before = np.get_printoptions(); from tsdf.picture import image; image.spectral_weights(); "
         "assert np.get_printoptions() == before"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -399,7 +399,7 @@ def test_place_of_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.delenv("TSDF_CACHE", raising=False)
     for value, folder in ((str(tmp_path / "xdg"), "xdg/tsdf"), ("relative", ".cache/tsdf"), ("", ".cache/tsdf")):
         monkeypatch.setenv("XDG_CACHE_HOME", value)
-        assert module._folder() == tmp_path / folder
+        assert module.cache_folder() == tmp_path / folder
 
 
 @pytest.mark.parametrize("fraction", [0.0, -0.1, 0.6401, 1.0, math.nan, math.inf])

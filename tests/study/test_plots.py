@@ -114,7 +114,8 @@ def test_no_global_state():
     """Importing plots imports no matplotlib; drawing keeps its settings."""
     script = (
         "import json, sys\n"
-        "from tsdf import plots, format\n"
+        "from tsdf.data import format\n"
+        "from tsdf.study import plots\n"
         "late = 'matplotlib' not in sys.modules\n"
         "import matplotlib\n"
         "before = dict(matplotlib.rcParams)\n"

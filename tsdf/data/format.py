@@ -13,8 +13,21 @@ from typing import Any
 import numpy as np
 
 from tsdf.data import container
+from tsdf.data.blocks import (
+    BY_NAME,
+    CONDITIONALS,
+    FORMAT_VERSION,
+    LONGEST,
+    MEMORY_FIELDS,
+    NAMES,
+    RECORD_FIELDS,
+    REQUIRED,
+    Block,
+    blocks_of,
+    version_for,
+)
 from tsdf.data.container import Broken, Format
-from tsdf.data.table import CONDITIONALS, FORMAT_VERSION, MEMORY_FIELDS, RECORD_FIELDS, Table, thawed, version_for
+from tsdf.data.table import Table, thawed
 from tsdf.errors import Finding, TSDFError
 
 # code: (severity, rule). The set is closed; SPEC.md lists it and `reference_data/golden` breaks each of them.
@@ -65,17 +78,9 @@ SUM_TOLERANCE = 1e-5  # of float32 masses summed in double
 ROUNDING = 1e-6  # of means of l, relative, and of records: rounded to float32
 LEDGER_TOLERANCE = 1e-3  # relative: a ledger may be kept in few units
 STATISTICS_TOLERANCE = 0.02  # beyond what the cells allow: far more than a tracer errs, far less than matters to render
-LONGEST = 1e30  # [R] of path lengths
 NARROWEST = 1e-30  # width of a cell, so that densities are finite even where subnormal numbers are taken for 0
 SLAB = 2**18  # pixels that are looked at together: a file of some MB may hold 2^26
 SPHERE_TOLERANCE = 2e-3  # [R^2] float32 loses sqrt(1 - b2) near grazing entry
-
-BLOCKS = ("p_theta", *CONDITIONALS, "mean_l")
-RECORDS = tuple(f"joint_{field}" for field in RECORD_FIELDS)
-MEMORY = ("memory_hit", *(f"memory_{field}" for field in MEMORY_FIELDS))
-KNOWN = BLOCKS + RECORDS + MEMORY
-AXIS_ENDS = {"p_r": (0.0, 2.0), "p_z": (-1.0, 2.0)}
-
 
 Wrong = Callable[[np.ndarray, slice], np.ndarray]  # of rows of a block, (n, columns) float64, and which they are
 Breach = Callable[[str, str, Wrong, str], Broken]  # code, block, where it is broken, what is wrong
@@ -130,8 +135,14 @@ def write(table: Table, path: str | os.PathLike[str]) -> None:
 
 
 def _broken_manifest(header: Mapping[str, Any], width: int, height: int, newer: bool) -> Broken:
-    blocks = header["blocks"]
-    names = [block["name"] for block in blocks]
+    """Rules of the header that the schema cannot state, (code, place, message)."""
+    yield from _broken_ledger(header)
+    yield from _broken_rows(header, height, newer)
+    yield from _broken_groups(header)
+    yield from _broken_axes(header, width)
+
+
+def _broken_ledger(header: Mapping[str, Any]) -> Broken:
     ledger = header["energy_ledger"]
     parts = sum(ledger[key] for key in ("unscattered", "scattered", "absorbed", "truncated", "lost"))
     if ledger["launched"] != parts:
@@ -144,12 +155,19 @@ def _broken_manifest(header: Mapping[str, Any], width: int, height: int, newer: 
             message = f"{name} is {header['statistics'][name]:.9g}, but of {whole} units of energy it is {part}"
             yield "HEADER_STATISTICS", f"/statistics/{name}", message
 
-    by_name = {block["name"]: block for block in blocks}
-    old = header["format_version"] == "1.0"
-    known = [name for name in names if name in KNOWN and not (old and name in MEMORY)]
 
+def _known(header: Mapping[str, Any]) -> list[str]:
+    """Return the names of a file's blocks that its version has and this reads, in the order of the file."""
+    allowed = blocks_of(header["format_version"])
+    return [block["name"] for block in header["blocks"] if block["name"] in allowed]
+
+
+def _broken_rows(header: Mapping[str, Any], height: int, newer: bool) -> Broken:
+    """Rules of the blocks as the file stacks them, one by one; where it follows a newer minor version, any name will
+    do."""
+    known, names = _known(header), [block["name"] for block in header["blocks"]]
     row = 0
-    for i, block in enumerate(blocks):
+    for i, block in enumerate(header["blocks"]):
         first, name, place = block["first_row"], block["name"], f"/blocks/{i}"
         if first != row:
             yield "MANIFEST_ROWS", f"{place}/first_row", f"it is {first}, but row {row} is next"
@@ -160,38 +178,54 @@ def _broken_manifest(header: Mapping[str, Any], width: int, height: int, newer: 
             yield "MANIFEST_UNKNOWN", f"{place}/name", f"version {header['format_version']} has no block {name}"
     if row != height:
         yield "MANIFEST_HEIGHT", "/blocks", f"the blocks have {row} rows, the image {height}"
-    if missing := [name for name in BLOCKS if name not in names]:
+
+
+def _broken_groups(header: Mapping[str, Any]) -> Broken:
+    """Rules of which blocks are there, in which order, and which have as many rows as others."""
+    known, rows = _known(header), {block["name"]: block["rows"] for block in header["blocks"]}
+    if missing := [name for name in REQUIRED if name not in rows]:
         yield "MANIFEST_MISSING", "/blocks", f"there is no block {', '.join(missing)}"
-    if known != sorted(known, key=KNOWN.index):
+    if known != sorted(known, key=NAMES.index):
         yield "MANIFEST_ORDER", "/blocks", "the blocks are not in the order of the specification"
-    if len({by_name[name]["rows"] for name in ("p_l", "mean_l") if name in by_name}) > 1:
+    if len({rows[name] for name in ("p_l", "mean_l") if name in rows}) > 1:
         yield "MANIFEST_MEAN", "/blocks", "mean_l has not as many rows as p_l"
-    counts = [by_name[name]["rows"] for name in RECORDS if name in by_name]
-    if counts and (len(counts) < len(RECORDS) or len(set(counts)) > 1):
+    joint, entry = (
+        [rows[name] for name in (f"{group}_{field}" for field in fields) if name in known]
+        for group, fields in (("joint", RECORD_FIELDS), ("memory", MEMORY_FIELDS))
+    )
+    if joint and (len(joint) < len(RECORD_FIELDS) or len(set(joint)) > 1):
         yield "MANIFEST_RECORDS", "/blocks", "the joint blocks are not six of equal length"
-    counts = [by_name[name]["rows"] for name in MEMORY[1:] if name in known]
-    if any(name in known for name in MEMORY) and (len(counts) < len(MEMORY_FIELDS) or len(set(counts)) > 1):
+    hit = "memory_hit" in known
+    if (hit or entry) and (len(entry) < len(MEMORY_FIELDS) or len(set(entry)) > 1):
         yield "MANIFEST_MEMORY", "/blocks", "the memory blocks of records are not seven of equal length"
-    elif counts and MEMORY[0] not in known:
+    elif entry and not hit:
         yield "MANIFEST_MEMORY", "/blocks", "there are records by entry, but no block memory_hit"
 
+
+def _broken_axes(header: Mapping[str, Any], width: int) -> Broken:
+    """Rules of the edges of cells, columns first."""
     edges = header["columns"]["edges"]
     if len(edges) != width + 1:
         yield "MANIFEST_WIDTH", "/columns/edges", f"{len(edges)} edges for {width} columns"
     whole = edges[0] == -1.0 and edges[-1] == 1.0
     yield from _broken_edges("/columns/edges", edges, (0, len(edges) - 2), whole)
-    for i, block in enumerate(blocks):
+    for i, block in enumerate(header["blocks"]):
         name, place = block["name"], f"/blocks/{i}/edges"
-        if name in CONDITIONALS:
-            edges = block["edges"]
-            if len(edges) != block["rows"] + 1:
-                yield "MANIFEST_EDGE_COUNT", place, f"{len(edges)} edges for {block['rows']} rows"
-            first, last = edges[0], edges[-1]
-            if name == "p_phi":
-                whole = -math.pi <= first <= 0.0 and abs(last - first - 2.0 * math.pi) <= 1e-9
-            else:
-                whole = (first, last) == AXIS_ENDS.get(name, (0.0, last))
-            yield from _broken_edges(place, edges, (0,) if name == "p_l" else (), whole)
+        if name not in CONDITIONALS:
+            continue
+        edges = block["edges"]
+        if len(edges) != block["rows"] + 1:
+            yield "MANIFEST_EDGE_COUNT", place, f"{len(edges)} edges for {block['rows']} rows"
+        yield from _broken_edges(place, edges, (0,) if name == "p_l" else (), _whole(name, edges[0], edges[-1]))
+
+
+def _whole(name: str, first: float, last: float) -> bool:
+    """Return whether the cells of a block of masses cover its axis; azimuths do in one turn that holds 0."""
+    if name == "p_phi":
+        return -math.pi <= first <= 0.0 and abs(last - first - 2.0 * math.pi) <= 1e-9
+    axis = BY_NAME[name].axis
+    assert axis is not None
+    return first == axis[0] and (last == axis[1] or math.isinf(axis[1]))
 
 
 def _broken_edges(place: str, edges: Sequence[float], atoms: tuple[int, ...], whole: bool) -> Broken:
@@ -216,7 +250,7 @@ def _nothing(pixels: np.ndarray) -> np.ndarray:
 
 def _broken_values(table: Table) -> Broken:
     """Rules of the pixels, (code, place of the first breach, message); not finite ones hide all others."""
-    blocks = [block for block in table.header["blocks"] if block["name"] in KNOWN]
+    blocks = [block for block in table.header["blocks"] if block["name"] in BY_NAME]
     first_row = {block["name"]: block["first_row"] for block in blocks}
 
     def breach(code: str, name: str, wrong: Wrong, what: str) -> Broken:
@@ -237,7 +271,7 @@ def _broken_values(table: Table) -> Broken:
             yield found
     if infinite:
         return
-    for name in BLOCKS:
+    for name in REQUIRED:
         yield from breach("VALUE_NEGATIVE", name, lambda values, _: values < 0.0, "negative")
     p_theta = table.p_theta
     if abs(p_theta.sum() - 1.0) > SUM_TOLERANCE:
@@ -254,7 +288,7 @@ def _broken_values(table: Table) -> Broken:
             return off & (np.arange(rows.start, rows.stop) == 0)[:, None]
 
         yield from breach("VALUE_COLUMN_SUM", name, uneven, "the column does not sum to 1")
-    for name in (name for name in first_row if name not in MEMORY):
+    for name in (name for name in first_row if BY_NAME[name].group != "memory"):
         yield from breach(
             "VALUE_EMPTY_COLUMN", name, lambda values, _: (values != 0.0) & empty, "not 0 though p_theta is"
         )
@@ -295,16 +329,14 @@ def _broken_values(table: Table) -> Broken:
 
 def _broken_records(kind: str, records: Mapping[str, np.ndarray], atoms: np.ndarray, breach: Breach) -> Broken:
     """Rules of the records of either kind; `atoms` are the columns in which entry_azimuth must be 0, (columns,)."""
-    pi = float(np.float32(math.pi))
-    low = {"r": 0.0, "z": -1.0, "phi_delta": -pi, "l": 0.0, "entry_b2": 0.0, "entry_azimuth": -pi, "cos_theta": -1.0}
-    high = {"r": 2.0, "z": 2.0, "phi_delta": pi, "l": LONGEST, "entry_b2": 1.0, "entry_azimuth": pi, "cos_theta": 1.0}
     for field in records:
+        block = BY_NAME[f"{kind}_{field}"]
 
-        def outside(values: np.ndarray, _: slice, field: str = field) -> np.ndarray:
-            bad = (values < low[field] - ROUNDING) | (values > high[field] + ROUNDING)
-            return bad | (atoms & (values != 0.0)) if field == "entry_azimuth" else bad
+        def outside(values: np.ndarray, _: slice, block: Block = block) -> np.ndarray:
+            bad = (values < block.low - ROUNDING) | (values > block.high + ROUNDING)
+            return bad | (atoms & (values != 0.0)) if block.field == "entry_azimuth" else bad
 
-        yield from breach("VALUE_RECORD_RANGE", f"{kind}_{field}", outside, "out of range")
+        yield from breach("VALUE_RECORD_RANGE", block.name, outside, "out of range")
 
     def falling(values: np.ndarray, rows: slice) -> np.ndarray:
         before = records["entry_b2"][max(rows.start - 1, 0) : rows.stop - 1]

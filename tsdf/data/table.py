@@ -6,24 +6,15 @@ radius R, angles in radians, absorption is the dimensionless product sigma_a R.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from tsdf.data.blocks import MEMORY_FIELDS, RECORD_FIELDS
 from tsdf.errors import UsageError
-
-FORMAT_VERSION = "1.1"  # the newest that this reads; see `version_for`
-CONDITIONALS = ("p_phi", "p_r", "p_z", "p_l")
-RECORD_FIELDS = ("r", "z", "phi_delta", "l", "entry_b2", "entry_azimuth")
-MEMORY_FIELDS = ("cos_theta", "entry_azimuth", "r", "z", "phi_delta", "l", "entry_b2")
-
-
-def version_for(blocks: Iterable[str]) -> str:
-    """Return the format version of a table with blocks of these names: the oldest that has them all."""
-    return "1.1" if any(name.startswith("memory_") for name in blocks) else "1.0"
 
 
 def frozen(value: Any) -> Any:
@@ -42,6 +33,13 @@ def thawed(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [thawed(item) for item in value]
     return value
+
+
+class Measured(NamedTuple):
+    """A number and its standard error, 0 where it is exact."""
+
+    value: float
+    error: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,3 +195,86 @@ class Table:
         edges = self.cos_theta_edges
         middle = 0.5 * (edges[1:] + edges[:-1])
         return min(max(float(lossless + middle @ (masses - self.deflection_masses())), -1.0), 1.0)
+
+    # --- in others' words, with standard errors; docs/glossary.md -----------------------------------------------------
+
+    @property
+    def projected_area(self) -> Measured:
+        """Mean area A of the grain's shadow over all directions [R^2]: hit_probability pi."""
+        return self._scaled("hit_probability", math.pi)
+
+    @property
+    def effective_radius(self) -> Measured:
+        """3 V / (4 A), A the projected area [R]."""
+        area, error = self.projected_area
+        radius = 0.75 * float(self.header["grain"]["volume"]) / area
+        return Measured(radius, radius * error / area)
+
+    @property
+    def absorption_enhancement(self) -> Measured:
+        """B = <l> A / V [1]: how much longer light is in the material than in a grain that does not refract."""
+        (area, area_error), (length, length_error) = self.projected_area, self._scaled("mean_path_length", 1.0)
+        b = length * area / float(self.header["grain"]["volume"])
+        return Measured(b, b * math.hypot(area_error / area, length_error / length if length > 0.0 else 0.0))
+
+    @property
+    def dark_share(self) -> Measured:
+        """Share of the directions inside, over the volume, that outside light cannot reach [1]: 1 - B / eta^2."""
+        (b, error), square = self.absorption_enhancement, float(self.header["optics"]["eta"]) ** 2
+        return Measured(1.0 - b / square, error / square)
+
+    def single_scattering_albedo(self, absorption_times_radius: float = 0.0) -> Measured:
+        """Return the share w of the light that met the grain and is not absorbed in it [1], without diffraction.
+
+        It is `albedo` over that of the lossless grain: what the tracer dropped is no absorption. Its error is that of
+        mean_path_length, by the variances of the path length and of what it leaves.
+        """
+        if absorption_times_radius == 0.0:
+            return Measured(1.0, 0.0)
+        p = self.p_theta / self.p_theta.sum()
+        kept, squares = (float(p @ self.survival(by * absorption_times_radius)) for by in (1.0, 2.0))
+        variance = self._path_variance()
+        error = float(self.header["standard_errors"]["mean_path_length"])
+        if not variance > 0.0:
+            return Measured(kept, absorption_times_radius * kept * error)
+        return Measured(kept, error * math.sqrt(max(0.0, squares - kept * kept) / variance))
+
+    def asymmetry_factor(self, absorption_times_radius: float = 0.0) -> Measured:
+        """Return the mean cosine g of geometrical optics, `mean_cosine`; its error by the energy that is left [1]."""
+        g = self.mean_cosine(absorption_times_radius)
+        p = self.p_theta / self.p_theta.sum()
+        edges = self.cos_theta_edges
+        middle = 0.5 * (edges[1:] + edges[:-1])
+        error = float(self.header["standard_errors"]["mean_cosine"])
+        lossless = self.mean_cosine()
+        spread = float(p @ (middle - lossless) ** 2)
+        if math.isnan(g) or not spread > 0.0:
+            return Measured(g, error)
+        kept, squares = (self.survival(by * absorption_times_radius) for by in (1.0, 2.0))
+        left = float((p * squares) @ (middle - g) ** 2) / float(p @ kept) ** 2
+        return Measured(g, error * math.sqrt(left / spread))
+
+    def asymmetry_factor_far_field(self, absorption_times_radius: float = 0.0) -> Measured:
+        """Return the mean cosine with diffraction, as large as the shadow and straight on [1]: (1 + w g) / (1 + w).
+
+        The extinction efficiency is then 2 and the single-scattering albedo (1 + w) / 2.
+        """
+        (w, w_error), (g, g_error) = (
+            self.single_scattering_albedo(absorption_times_radius),
+            self.asymmetry_factor(absorption_times_radius),
+        )
+        if math.isnan(g):  # all that is left is diffracted
+            return Measured(1.0, 0.0)
+        error = math.hypot(w * g_error / (1.0 + w), (1.0 - g) * w_error / (1.0 + w) ** 2)
+        return Measured((1.0 + w * g) / (1.0 + w), error)
+
+    def _scaled(self, name: str, by: float) -> Measured:
+        """Return one of the statistics times a factor."""
+        return Measured(by * float(self.statistics[name]), by * float(self.header["standard_errors"][name]))
+
+    def _path_variance(self) -> float:
+        """Return the variance of the path length, by the cells [R^2]."""
+        p = self.p_theta / self.p_theta.sum()
+        lengths = self.block("mean_l").astype(np.float64)
+        mean, square = (float(p @ (self.p_l * lengths**power).sum(axis=0)) for power in (1, 2))
+        return max(0.0, square - mean * mean)

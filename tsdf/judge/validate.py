@@ -21,7 +21,7 @@ import numpy as np
 from tsdf.data import format
 from tsdf.data.table import Table
 from tsdf.errors import Finding, FormatWarning
-from tsdf.judge import analytic
+from tsdf.judge import analytic, equilibrium
 
 # code: (severity, rule). The set is closed; SPEC.md, annex A, lists it and `golden/checks` breaks each one.
 CODES = {
@@ -76,7 +76,7 @@ CODES = {
     ),
     "PHYSICS_PATH_LENGTH": (
         "error",
-        "paths inside are no longer than equilibrium allows, as long if eta <= 1",
+        "paths inside are no longer than equilibrium allows, as long in spheres, boxes, prisms and if eta <= 1",
     ),
     "PHYSICS_IDENTITY": ("error", "a grain of eta 1 lets light pass straight on"),
     "PHYSICS_RECIPROCITY": ("error", "joint records agree with their reversed paths: mean z is that of both"),
@@ -758,11 +758,12 @@ def _theorems(gavel: _Judge, t: _Subject) -> None:
     gavel.within("PHYSICS_CHORD", pointer, what, chord, min(low, 2.0) - slack, 2.0 + slack)
 
     # in equilibrium the radiance inside is eta^2 times that outside, wherever light gets at all
-    bound = t.eta**2 * volume / (math.pi * hit)
+    reached = equilibrium.reach(grain, t.eta)
+    bound = t.eta**2 * volume / (math.pi * hit) * (1.0 if reached is None else reached)
     slack = t.noise("mean_path_length") + t.noise("hit_probability") * bound / hit
     slack += ROUNDING * max(bound, 1.0)
     bounces = t.header["provenance"]["max_bounces"] or 0
-    low = bound - slack - t.dropped * (2.0 * bounces + 2.0) if t.eta <= 1.0 else 0.0
+    low = 0.0 if reached is None else bound - slack - t.dropped * (2.0 * bounces + 2.0)
     pointer, mean = "/statistics/mean_path_length", s["mean_path_length"]
     gavel.within("PHYSICS_PATH_LENGTH", pointer, "mean_path_length", mean, low, bound + slack)
 

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from tsdf.data.table import CONDITIONALS, MEMORY_FIELDS, RECORD_FIELDS, Table, version_for
+from tsdf.data.blocks import BLOCKS, MEMORY_FIELDS, RECORD_FIELDS, version_for
+from tsdf.data.table import Table
 from tsdf.errors import TSDFError
 from tsdf.grain.optics import Optics
 from tsdf.judge import analytic
@@ -621,7 +622,7 @@ def software() -> str:
         return "tsdf-toolkit"
 
 
-def assemble(
+def assemble(  # noqa: PLR0913 - by keyword: what a header holds
     *,
     grain: Mapping[str, Any],
     optics: Optics,
@@ -651,34 +652,21 @@ def assemble(
         | {name: min(max(statistics[name], low), high) for name, (low, high) in RANGES.items()}
         | {"legendre_moments": [min(max(moment, -1.0), 1.0) for moment in statistics["legendre_moments"]]}
     )
-    axes = {
-        "p_phi": ("phi_delta", "rad", T.PHI_EDGES),
-        "p_r": ("r", "R", T.R_EDGES),
-        "p_z": ("z", "R", T.Z_EDGES),
-        "p_l": ("l", "R", T.L_EDGES),
-    }
-    blocks: list[dict[str, Any]] = [{"name": "p_theta", "kind": "mass", "first_row": 0, "rows": 1}]
-    rows = [p_theta[None, :]]
-
-    def stack(entry: dict[str, Any], values: np.ndarray) -> None:
-        place = {"first_row": sum(len(part) for part in rows), "rows": len(values)}
-        blocks.append({"name": entry.pop("name"), "kind": entry.pop("kind"), **place, **entry})
-        rows.append(values)
-
-    for name in CONDITIONALS:
-        quantity, unit, axis = axes[name]
-        entry = {"name": name, "kind": "mass", "quantity": quantity, "unit": unit, "edges": axis.tolist()}
-        stack(entry, conditionals[name])
-    stack({"name": "mean_l", "kind": "mean", "of": "p_l", "unit": "R"}, mean_l)
-    units = {"phi_delta": "rad", "entry_azimuth": "rad", "entry_b2": "R^2", "cos_theta": "1"}
+    values = {"p_theta": p_theta[None, :], **conditionals, "mean_l": mean_l}
     if joint is not None:
-        for name, values in zip(RECORD_FIELDS, joint, strict=True):
-            stack({"name": f"joint_{name}", "kind": "record", "unit": units.get(name, "R")}, values)
+        values |= {f"joint_{name}": rows for name, rows in zip(RECORD_FIELDS, joint, strict=True)}
     if memory is not None:
-        stack({"name": "memory_hit", "kind": "probability"}, memory.hit[None, :])
-        for name, values in zip(MEMORY_FIELDS, memory.records, strict=True):
-            stack({"name": f"memory_{name}", "kind": "record", "unit": units.get(name, "R")}, values)
-    pixels = np.concatenate(rows).astype(np.float32)
+        values |= {f"memory_{name}": rows for name, rows in zip(MEMORY_FIELDS, memory.records, strict=True)}
+        values["memory_hit"] = memory.hit[None, :]
+    edges_of = {"p_phi": T.PHI_EDGES, "p_r": T.R_EDGES, "p_z": T.Z_EDGES, "p_l": T.L_EDGES}
+    blocks: list[dict[str, Any]] = []
+    stacked: list[np.ndarray] = []
+    for block in BLOCKS:
+        if block.name in values:
+            axis = edges_of[block.name].tolist() if block.axis else None
+            blocks.append(block.entry(sum(map(len, stacked)), len(values[block.name]), axis))
+            stacked.append(values[block.name])
+    pixels = np.concatenate(stacked).astype(np.float32)
     header = {
         "format": "tsdf",
         "format_version": version_for(block["name"] for block in blocks),

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from tsdf.compiled import njit
-from tsdf.data.table import MEMORY_FIELDS, RECORD_FIELDS, Table
+from tsdf.data.blocks import MEMORY_FIELDS, RECORD_FIELDS
+from tsdf.data.table import Table
 from tsdf.errors import UsageError
 from tsdf.grain.optics import Optics
 from tsdf.judge import analytic

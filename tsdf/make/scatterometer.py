@@ -191,7 +191,18 @@ def grain_header(grain: Grain) -> dict[str, Any]:
         "faces": len(grain.faces),
         "mesh_sha256": grain.mesh_hash or None,
         "notes": [printable(note)[:1000] for note in grain.notes[:256]],
+        **extent_header(grain),
     }
+
+
+def extent_header(grain: Grain) -> dict[str, float]:
+    """Return how large a grain is across [R], to four decimals so that every machine finds the same."""
+    if grain.kind == "sphere":
+        return {"x_maximum_dimension": 2.0, "x_sieve": 2.0}
+    from tsdf.grain.extent import maximum_dimension, sieve
+
+    across = maximum_dimension(grain.vertices), sieve(grain.vertices)
+    return {"x_maximum_dimension": round(across[0], 4), "x_sieve": round(across[1], 4)}
 
 
 def canonical_command(grain: Mapping[str, Any], optics: Optics, effort: Effort, traced: bool) -> str:

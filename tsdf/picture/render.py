@@ -14,14 +14,18 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from tsdf.errors import SceneError, UsageError
 from tsdf.handle import Handle
 from tsdf.picture.world import World, camera_of, sees
+from tsdf.scene.levels import LEVELS
+from tsdf.walk import packed
 from tsdf.walk import transport as T
 from tsdf.walk import walker as W
+from tsdf.walk.hybrid import ALL
 from tsdf.walk.transport import Camera
 
 SLOTS = 2048  # walkers under way at once, per thread, but for shadows: their state stays in the second-level cache
@@ -54,6 +58,8 @@ class Picture:
         Paths given up because nothing let their light out, and rays that lost track of a surface.
     interrupted : bool
         Whether it is less than what was asked for because the user stopped it.
+    leapt, leaps : int
+        How many of the events were not drawn one by one, and how many leaps stand for them.
     """
 
     rgb: np.ndarray
@@ -65,6 +71,8 @@ class Picture:
     truncated: int
     faults: int
     interrupted: bool
+    leapt: int = 0
+    leaps: int = 0
 
     @property
     def relative_error(self) -> float:
@@ -84,27 +92,34 @@ class Walkers:
         Walkers under way, and what they were.
     radiance : (n, 3) float64
         Found so far by each sample; `reserve` makes room.
-    counters : (4,) int64
+    counters : (6,) int64
         See `walker.EVENTS`.
     """
 
     def __init__(self, world: World) -> None:
-        self.arrays = Handle(
-            T.WorldArrays(
-                world.place.arrays, world.place.room, world.media, world.tables, world.lights, world.packed.arrays,
-                world.memory, world.absorption,
-            )
+        near = T.WorldArrays(
+            world.place.arrays, world.place.room, world.media, world.tables, world.lights, world.packed.arrays,
+            world.memory, world.leaps, world.absorption,
         )  # fmt: skip
-        self.place, self.packed = world.place, world.packed
-        engines, exemplars = len(self.place.engines), len(self.packed.engines)
+        self.near = self.arrays = Handle(near)
+        if 0 < world.media.singles < ALL:  # another level's law takes over, where it may have more or less room
+            self.near = Handle(near._replace(media=world.media._replace(traits=LEVELS["explicit"].traits)))
+            self.arrays = Handle(near._replace(geometry=world.brim.arrays))
+        self.place, self.brim, self.packed = world.place, world.brim, world.packed
+        self.answered = world.media.traits.answered
+        exemplars = len(self.packed.engines)
         self.walkers = [np.zeros(ROOM, W.WALKER) for _ in range(2)]
         self.amounts = [np.zeros((ROOM, world.amounts)) for _ in range(2)]
-        self.hits = np.full((ROOM + 1, engines), -1, np.int32)
+        self.near_hits = np.full((ROOM + 1, len(self.place.engines)), -1, np.int32)
+        self.hits = self.near_hits
+        if self.brim is not self.place:
+            self.hits = np.full((ROOM + 1, len(self.brim.engines)), -1, np.int32)
         self.grain_hits = np.full((exemplars, ROOM), -1, np.int32)
         self.starts, self.ways = (np.zeros((ROOM, 3), np.float32) for _ in range(2))
         self.grain_starts, self.grain_ways = (np.zeros((exemplars, ROOM, 3), np.float32) for _ in range(2))
-        self.counters = np.zeros(4, np.int64)
+        self.counters = np.zeros(6, np.int64)
         self.asked = np.zeros(W.GRAINS_ASKED + exemplars, np.int64)
+        self.spectrum = np.zeros(world.absorption.spectral.shape[1])
         self.radiance = np.zeros((0, 3))
         self.reserve(1)
 
@@ -112,14 +127,23 @@ class Walkers:
         """Let so many samples have found nothing yet."""
         if len(self.radiance) < samples:
             self.radiance = np.zeros((samples, 3))
-            self.batches = [Handle(batch) for batch in (self._batch(0, 1), self._batch(1, 0))]
+            self._lay_out()
         self.radiance[:samples] = 0.0
 
-    def _batch(self, now: int, then: int) -> W.Batch:
-        return W.Batch(
-            self.walkers[now], self.amounts[now], self.walkers[then], self.amounts[then], self.hits, self.grain_hits,
-            self.starts, self.ways, self.grain_starts, self.grain_ways, self.radiance, self.counters, self.asked,
-        )  # fmt: skip
+    def _lay_out(self) -> None:
+        """Make the handles of both directions, and those of the single grains, whose ray engine is another."""
+        batches = [
+            W.Batch(
+                self.walkers[now], self.amounts[now], self.walkers[then], self.amounts[then], self.hits,
+                self.grain_hits, self.starts, self.ways, self.grain_starts, self.grain_ways, self.radiance,
+                self.counters, self.asked, self.spectrum,
+            )
+            for now, then in ((0, 1), (1, 0))
+        ]  # fmt: skip
+        self.batches = [Handle(batch) for batch in batches]
+        self.near_batches = self.batches.copy()
+        if self.hits is not self.near_hits:
+            self.near_batches = [Handle(batch._replace(hits=self.near_hits)) for batch in batches]
 
     def follow(self, job: T.Job, pixels: int, stop: threading.Event) -> np.ndarray:
         """Return the radiance (pixels, spp, 3) of the samples of a job, of so many pixels.
@@ -144,15 +168,19 @@ class Walkers:
     def turn(self, live: int) -> int:
         """Take the first `live` of ``walkers[0]`` as far as they come without the ray engine, ask it, and return how
         many go on; ``walkers[1]`` then holds what they were, those that have ended as they ended."""
-        T.advance(self.arrays, self.batches[0], live)
+        if self.answered:
+            packed.answer(self.arrays, self.batches[0], live)
+        T.advance(self.near, self.arrays, self.near_batches[0], self.batches[0], live)
         live, rays = int(self.asked[W.LIVE]), int(self.asked[W.ASKED])
         if rays:
-            self.place.hits(self.starts[:rays], self.ways[:rays], self.hits.T)
+            self.place.hits(self.starts[:rays], self.ways[:rays], self.near_hits.T)
+            if self.brim is not self.place:
+                self.brim.hits(self.starts[:rays], self.ways[:rays], self.hits.T)
         for e, asked in enumerate(self.asked[W.GRAINS_ASKED :]):
             if asked:
                 starts, ways = self.grain_starts[e, :asked], self.grain_ways[e, :asked]
                 self.grain_hits[e, :asked] = self.packed.hits(e, starts, ways)
-        for pair in (self.batches, self.walkers, self.amounts):
+        for pair in (self.batches, self.near_batches, self.walkers, self.amounts):
             pair.reverse()
         return live
 
@@ -211,17 +239,10 @@ def measure(
     stop: threading.Event | None = None,
 ) -> Picture:
     """Return the picture that any camera takes, as `render` does for the scene's own; of a parallel beam, say."""
-    if spp is None and seconds is None and target_error is None:
-        raise UsageError("say when to stop: samples per pixel, seconds or a target error")
-    for name, value in (("spp", spp), ("seconds", seconds), ("target error", target_error)):
-        if value is not None and not 0 < value < math.inf:
-            raise UsageError(f"{name} must be a finite number above 0, not {value}")
+    goal = Goal(spp, seconds, target_error)
     threads = threads or os.cpu_count() or 1
-    stop = stop or threading.Event()
-    halt = threading.Event()
-    count = width * height
-    total, squares = np.zeros((count, 3)), np.zeros((count, 3))
-    samples = np.zeros(count, np.int64)
+    stop, halt = stop or threading.Event(), threading.Event()
+    sums, count = Sums(width, height), width * height
     pool = [Walkers(world) for _ in range(threads)]
     pool[0].follow(T.Job(camera, 0, 1, 0, seed), 1, halt)  # compiles, outside the time
     for walkers in pool:
@@ -229,87 +250,184 @@ def measure(
     free = list(pool)
     begin = time.perf_counter()
 
-    def job(pixel: int, pixels: int, number: int, sample: int) -> np.ndarray:
+    def follow(block: Block) -> np.ndarray:
         mine = free.pop()
         try:
-            return mine.follow(T.Job(camera, pixel, number, sample, seed), pixels, halt)
+            return mine.follow(T.Job(camera, block.pixel, block.number, block.sample, seed), block.pixels, halt)
         finally:
             free.append(mine)
 
+    def spent() -> float:
+        return time.perf_counter() - begin
+
     def picture(interrupted: bool) -> Picture:
-        n = np.maximum(samples, 1)[:, None]
-        mean = total / n
-        with np.errstate(invalid="ignore", divide="ignore"):
-            variance = np.where(n > 1, np.maximum(squares / n - mean**2, 0.0) / np.maximum(n - 1, 1), math.inf)
-        counters = np.sum([walkers.counters for walkers in pool], axis=0)
-        shape = (height, width, 3)
-        return Picture(
-            mean.reshape(shape), variance.reshape(shape), samples.reshape(height, width), int(counters[W.EVENTS]),
-            int(counters[W.RAYS]), time.perf_counter() - begin, int(counters[W.TRUNCATED]), int(counters[W.FAULTS]),
-            interrupted,
-        )  # fmt: skip
-
-    def following(share: int, took: float) -> int:
-        """Return how many samples per pixel the next pass has, 0 for no next pass; the last one had `share`."""
-        most = max(FEW, PARTS * BLOCK // count)
-        if spp is not None:
-            return min(most if share else 1, spp - done)
-        if seconds is None:
-            return most if share else 1
-        if not share:
-            return 1
-        left = seconds - (time.perf_counter() - begin)
-        each = max(took, 1e-6) / share  # of a pass of one sample
-        return min(max(int(min(left, seconds / PARTS) / each), int(left >= each)), most, GROWTH * share)
-
-    def blocks(share: int) -> Iterator[tuple[int, int, int, int]]:
-        """First pixel, pixels, samples of each and the number of the first, one block of a pass after the other."""
-        size = min(max(share * count // PARTS, LEAST), BLOCK)
-        number = min(share, size)
-        step = max(1, size // number)
-        for sample in range(done, done + share, number):
-            for pixel in range(0, count, step):
-                yield pixel, min(step, count - pixel), min(number, done + share - sample), sample
+        return sums.picture(np.sum([walkers.counters for walkers in pool], axis=0), spent(), interrupted)
 
     done, share, took, reached = 0, 0, 0.0, math.inf
-    waiting: deque[tuple[tuple[int, int, int, int], Future]] = deque()
     with ThreadPoolExecutor(threads) as executor:
         try:
-            while not stop.is_set() and (share := following(share, took)) > 0:
-                coming, found, start = blocks(share), 0, time.perf_counter()
-                while not stop.is_set():
-                    while len(waiting) < 2 * threads and (block := next(coming, None)):
-                        waiting.append((block, executor.submit(job, *block)))
-                    if not waiting:
-                        break
-                    (pixel, pixels, number, _), future = waiting[0]
-                    try:
-                        radiance = future.result(timeout=0.1)
-                    except TimeoutError:
-                        continue
-                    waiting.popleft()
-                    total[pixel : pixel + pixels] += radiance.sum(axis=1)
-                    squares[pixel : pixel + pixels] += (radiance**2).sum(axis=1)
-                    samples[pixel : pixel + pixels] += number
-                    found += number * pixels
+            while not stop.is_set() and (share := goal.following(done, share, took, spent(), count)) > 0:
+                found, start = 0, time.perf_counter()
+                for block, radiance in _in_turn(executor, follow, _blocks(count, done, share), 2 * threads, stop):
+                    sums.add(block, radiance)
+                    found += block.number * block.pixels
                     if progress is not None:
-                        part = (done + found / count) / spp if spp else 0.0
-                        if seconds is not None:
-                            part = min(1.0, (time.perf_counter() - begin) / seconds)
-                        if target_error is not None and done > 1:
-                            part = min(1.0, (target_error / reached) ** 2)
-                        progress(part, f"{done + found // count} spp")
-                else:
+                        progress(goal.part(done, found / count, spent(), reached), f"{done + found // count} spp")
+                if stop.is_set():
                     break
                 took, done = time.perf_counter() - start, done + share
                 if target_error is not None and done > 1:
                     reached = max(picture(False).relative_error, 1e-9)
-                    if reached <= target_error:
-                        break
-                if target_error is not None and done >= BLACK and not total.any():
+                if goal.reached(done, reached, sums.black):
                     break
         except KeyboardInterrupt:
             stop.set()
         finally:
             halt.set()
     return picture(stop.is_set())
+
+
+# ------------------------------------------------------------------------------------- passes, and when to stop
+
+
+class Block(NamedTuple):
+    """Samples that one thread takes at once: first pixel, pixels, samples of each and the number of the first."""
+
+    pixel: int
+    pixels: int
+    number: int
+    sample: int
+
+
+def _blocks(count: int, done: int, share: int) -> Iterator[Block]:
+    """Yield the blocks of a pass of `share` samples over `count` pixels, each of which has `done` of them already."""
+    size = min(max(share * count // PARTS, LEAST), BLOCK)
+    number = min(share, size)
+    step = max(1, size // number)
+    for sample in range(done, done + share, number):
+        for pixel in range(0, count, step):
+            yield Block(pixel, min(step, count - pixel), min(number, done + share - sample), sample)
+
+
+def _in_turn(
+    executor: ThreadPoolExecutor,
+    follow: Callable[[Block], np.ndarray],
+    coming: Iterator[Block],
+    at_once: int,
+    stop: threading.Event,
+) -> Iterator[tuple[Block, np.ndarray]]:
+    """Yield blocks and what `follow` returns of each, in their order, until `stop` is set; so many are under way."""
+    waiting: deque[tuple[Block, Future]] = deque()
+    while not stop.is_set():
+        while len(waiting) < at_once and (block := next(coming, None)):
+            waiting.append((block, executor.submit(follow, block)))
+        if not waiting:
+            return
+        block, future = waiting[0]
+        try:
+            radiance = future.result(timeout=0.1)
+        except TimeoutError:
+            continue
+        waiting.popleft()
+        yield block, radiance
+
+
+class Sums:
+    """Sums over the samples of each pixel, and the picture that they make.
+
+    Attributes
+    ----------
+    total, squares : (h * w, 3) float64
+        Of radiance, and of its square.
+    samples : (h * w,) int64
+    """
+
+    def __init__(self, width: int, height: int) -> None:
+        self.shape = (height, width, 3)
+        self.total, self.squares = np.zeros((width * height, 3)), np.zeros((width * height, 3))
+        self.samples = np.zeros(width * height, np.int64)
+
+    @property
+    def black(self) -> bool:
+        """Whether no sample has found light yet."""
+        return not self.total.any()
+
+    def add(self, block: Block, radiance: np.ndarray) -> None:
+        """Add the radiance (pixels, number, 3) of a block."""
+        own = slice(block.pixel, block.pixel + block.pixels)
+        self.total[own] += radiance.sum(axis=1)
+        self.squares[own] += (radiance**2).sum(axis=1)
+        self.samples[own] += block.number
+
+    def picture(self, counters: np.ndarray, seconds: float, interrupted: bool) -> Picture:
+        """Return the picture so far; counters (4,) as in `Walkers`, seconds [s] that it took."""
+        n = np.maximum(self.samples, 1)[:, None]
+        mean = self.total / n
+        with np.errstate(invalid="ignore", divide="ignore"):
+            variance = np.where(n > 1, np.maximum(self.squares / n - mean**2, 0.0) / np.maximum(n - 1, 1), math.inf)
+        return Picture(
+            rgb=mean.reshape(self.shape),
+            variance=variance.reshape(self.shape),
+            samples=self.samples.reshape(self.shape[:2]),
+            events=int(counters[W.EVENTS]),
+            rays=int(counters[W.RAYS]),
+            seconds=seconds,
+            truncated=int(counters[W.TRUNCATED]),
+            leapt=int(counters[W.LEAPT]),
+            leaps=int(counters[W.LEAPS]),
+            faults=int(counters[W.FAULTS]),
+            interrupted=interrupted,
+        )
+
+
+@dataclass(frozen=True)
+class Goal:
+    """When a picture is done: at so many samples per pixel, after so many seconds, or at a relative error.
+
+    Raises
+    ------
+    UsageError
+        If none of them is given, or one is out of range.
+    """
+
+    spp: int | None
+    seconds: float | None
+    target_error: float | None
+
+    def __post_init__(self) -> None:
+        limits = (("spp", self.spp), ("seconds", self.seconds), ("target error", self.target_error))
+        if all(value is None for _, value in limits):
+            raise UsageError("say when to stop: samples per pixel, seconds or a target error")
+        for name, value in limits:
+            if value is not None and not 0 < value < math.inf:
+                raise UsageError(f"{name} must be a finite number above 0, not {value}")
+
+    def following(self, done: int, share: int, took: float, spent: float, count: int) -> int:
+        """Return how many samples per pixel the next pass has, 0 for no next pass.
+
+        Each of `count` pixels has `done` of them after `spent` seconds; the last pass had `share` and `took` seconds.
+        """
+        most = max(FEW, PARTS * BLOCK // count)
+        if self.spp is not None:
+            return min(most if share else 1, self.spp - done)
+        if self.seconds is None:
+            return most if share else 1
+        if not share:
+            return 1
+        left = self.seconds - spent
+        each = max(took, 1e-6) / share  # of a pass of one sample
+        return min(max(int(min(left, self.seconds / PARTS) / each), int(left >= each)), most, GROWTH * share)
+
+    def part(self, done: int, found: float, spent: float, error: float) -> float:
+        """Return the share done in [0, 1], with `found` samples per pixel of a pass after `done`, at this error."""
+        if self.target_error is not None and done > 1:
+            return min(1.0, (self.target_error / error) ** 2)
+        if self.seconds is not None:
+            return min(1.0, spent / self.seconds)
+        return (done + found) / self.spp if self.spp else 0.0
+
+    def reached(self, done: int, error: float, black: bool) -> bool:
+        """Return whether an error is small enough after `done` samples per pixel, or never will be."""
+        if self.target_error is None:
+            return False
+        return (done > 1 and error <= self.target_error) or (done >= BLACK and black)

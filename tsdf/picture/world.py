@@ -1,14 +1,14 @@
 """A scene at one level of detail, as the arrays that `transport` follows light through.
 
-Here free paths, phase functions and absorption spectra become numbers per medium and component; how light uses them is
-`transport`, pictures are `render`. The levels, cheapest first: isotropic (point scatterers, similarity), volume-hg (one
-Henyey-Greenstein lobe), volume (tabulated deflections), teleport (Algorithm 1 of Meng et al. 2015), teleport-joint (its
-offsets kept together), teleport-memory (where neighbours are as well), explicit (packed grains, traced).
+Media become numbers in `media`; how light uses them is `transport`, pictures are `render`. The levels, cheapest first:
+isotropic (point scatterers, similarity), volume-hg (one Henyey-Greenstein lobe), volume (tabulated deflections),
+teleport (Algorithm 1 of Meng et al. 2015), teleport-joint (its offsets kept together), teleport-memory (where
+neighbours are as well), teleport-packed (packed grains, answered by records), explicit (packed grains, traced).
 """
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,14 +17,15 @@ from numpy.typing import ArrayLike
 from tsdf.data import format
 from tsdf.data.sampler import Tables, compile_tables
 from tsdf.data.table import Table
-from tsdf.errors import SceneError, TSDFError
+from tsdf.errors import SceneError, TSDFError, UsageError
 from tsdf.grain.grains import first_hit, load_grain
 from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.picture import image
+from tsdf.picture.leaping import GAMMA, checked, leaping
+from tsdf.picture.media import DARKEST, media_of, spectra_of
 from tsdf.scene.levels import LEVELS, Traits
-from tsdf.scene.medium import Component, VolumeParameters, free_path, volume_parameters
-from tsdf.scene.scene import Absorption as AbsorptionSpec
+from tsdf.scene.medium import Component, VolumeParameters, free_path
 from tsdf.scene.scene import (
     Box,
     ConstantLight,
@@ -35,27 +36,27 @@ from tsdf.scene.scene import (
     Scene,
     Slab,
     SunLight,
-    absorption_at,
     called,
 )
 from tsdf.spheres.neighbours import law
 from tsdf.vectors import frame
 from tsdf.walk.explicit import Packed, nothing_packed, packed
 from tsdf.walk.geometry import MESH, Place, Triangles, ball_hit, exact_hit, place
-from tsdf.walk.lights import LUMINANCE, LightArrays, compile_lights
+from tsdf.walk.hybrid import hybrid_notes, singles_of
+from tsdf.walk.leaps import Leaps
+from tsdf.walk.lights import LightArrays, compile_lights
 from tsdf.walk.memory import Memory, memory_of
 from tsdf.walk.transport import Camera
 from tsdf.walk.walker import MAX_EVENTS, Absorption, Media
 
 CAPTIVES = 32  # paths that look for a way out from the camera
+OUTLIVED = 1000.0  # of the grains met in the mean, after which a path that leaps is given up: no light lives as long
+MOST_EVENTS = 1 << 60  # that a walker counts
 BOUNCES = 500  # after which there is none; a hole of a thousandth of all surfaces is found by then
 SLOW = 1e5  # grains met by a path, beyond which it is said how long that takes
 ENDLESS = 1e7  # beyond which a path takes seconds
 EVENTS_PER_SECOND = 1e7  # of one thread, about
-DARKEST = 1e-300  # albedo, so that it has a logarithm
-FARTHEST = 1e300  # free path where nothing deflects, finite so that 0 of it is 0
 LOOKS = 200  # pixels along each side through which it is looked whether the camera sees anything
-LONGEST_OFFSET = math.sqrt(8.0)  # [R] r and z drawn independently: at most 2 each
 
 
 @dataclass(eq=False)
@@ -66,11 +67,15 @@ class World:
     ----------
     scene : Scene
     level : str
+    leap : float
+        Radius of the smallest leap in transport mean free paths, 0 where no medium is deep enough.
     place : Place
         Geometry and its ray engine.
+    brim : Place
+        Where the chain goes on after the first grains if that is another place: media that it fills to the brim.
     packed : Packed
-        Grains of the explicit level.
-    media, tables, memory, lights, absorption
+        Grains that are met one by one.
+    media, tables, memory, leaps, lights, absorption
         Arrays for kernels.
     amounts : int
         How many amounts of matter a walker counts.
@@ -82,11 +87,14 @@ class World:
 
     scene: Scene
     level: str
+    leap: float
     place: Place
+    brim: Place
     packed: Packed
     media: Media
     tables: Tables
     memory: Memory
+    leaps: Leaps
     lights: LightArrays
     absorption: Absorption
     amounts: int
@@ -205,7 +213,10 @@ def _triple(v: np.ndarray) -> tuple[float, float, float]:
     return float(v[0]), float(v[1]), float(v[2])
 
 
-def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
+def build(
+    scene: Scene, level: str, limit: int = MAX_EVENTS, leap: float | None = None,
+    progress: Callable[[float, str], None] | None = None,
+) -> World:  # fmt: skip
     """Return a scene ready to be rendered at a level.
 
     Parameters
@@ -213,7 +224,12 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
     scene : Scene
     level : str
     limit : int
-        Grains met after which a path is given up.
+        Grains met after which a path is given up; many more, if it is not given, where paths leap over most of them.
+    leap : float, optional
+        Radius of the smallest leap in transport mean free paths, 0 for none; else what the scene says, or `GAMMA`, where
+        the level leaps at all.
+    progress : callable, optional
+        Called with the share done and a word about it while records for leaps are made.
 
     Raises
     ------
@@ -222,7 +238,8 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
     """
     if level not in LEVELS:
         raise SceneError(f"{scene.name}: no level {level!r}; levels are {', '.join(LEVELS)}")
-    traits = LEVELS[level].traits
+    traits, singles = LEVELS[level].traits, singles_of(scene, level)
+    gamma = _gamma(scene, level, leap)
     read: dict[str, Table] = {}
 
     def table_of(spec: GrainSpec) -> Table:
@@ -234,9 +251,11 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
         return read[file]
 
     tables = [table_of(grain) for medium in scene.media for grain in medium.grains]
-    made = place(scene, grains=traits.placed)
+    made = brim = place(scene, grains=traits.placed or singles > 0)
+    if not traits.placed and singles and any(medium.inside == "centres" for medium in scene.media):
+        brim = place(scene)
     notes = list(made.notes)
-    media, absorption, parameters = _media(scene, traits, tables, limit)
+    media, absorption, parameters = media_of(scene, traits, tables, limit)
     if records := LEVELS[level].records:
         for grain, table in zip((g for m in scene.media for g in m.grains), tables, strict=True):
             if not getattr(table, records.block):
@@ -244,7 +263,7 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
                     f"{scene.name}: {grain.table} has no {records.name}, which level {level} draws from; "
                     f"build it with {records.option}"
                 )
-    memory = _memory(scene, tables if traits.remembers else [])
+    memory = _memory(scene, tables if traits.remembers or traits.answered else [], traits.remembers)
     for number, (medium, boundary) in enumerate(zip(scene.media, made.boundaries, strict=True), 1):
         extent = _extent(medium, boundary.vertices if boundary is not None else None)
         if 2.0 * medium.radius > extent and medium.inside == "grains":
@@ -252,23 +271,37 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
                 f"{scene.name}: {called('medium', number, medium.name)}: a grain of diameter {2.0 * medium.radius:g} "
                 f"does not fit into the medium, which is {extent:.3g} thin"
             )
-    notes += _long_paths(scene, traits, tables, made, parameters, limit)
     lights, said = _lights(scene)
+    compiled = compile_tables(tables or [_no_table()], joint=traits.joint)
+    leaps, deep = leaping(scene, brim, media, compiled, memory, tables, gamma, bool(lights.sampled), progress)
+    met = _grains_met(scene, traits, tables, made, parameters, limit)
+    if any(deep) and limit == MAX_EVENTS:
+        longest = OUTLIVED * max(n for n, there in zip(met, deep, strict=True) if there)
+        media = media._replace(limit=int(min(max(limit, longest), MOST_EVENTS)))
+    notes += _long_paths(scene, [0.0 if there else n for n, there in zip(met, deep, strict=True)])
     notes += said
-    if traits.packed and scene.media and lights.sampled:
+    if singles and scene.media and lights.sampled:
         notes.append(
-            f"{scene.name}: level explicit meets suns and small bright lights by chance alone: until many samples "
-            "have, the picture is too dark and its variance does not tell; widen the sun or light by a smooth sky"
+            f"{scene.name}: {f'level {level} meets' if traits.packed else 'explicit grains meet'} suns and small "
+            "bright lights by chance alone: until many samples have, the picture is too dark and its variance does not "
+            "tell; widen the sun or light by a smooth sky"
         )
-    grains = packed(scene, tables) if traits.packed and scene.media else nothing_packed(len(scene.media), len(tables))
+    if singles and not traits.packed:
+        notes += hybrid_notes(scene, tables)
+    grains = nothing_packed(len(scene.media), len(tables))
+    if singles and scene.media:
+        grains = packed(scene, tables, traced=not traits.answered)
     return World(
         scene=scene,
         level=level,
+        leap=gamma if any(deep) else 0.0,
         place=made,
+        brim=brim,
         packed=grains,
-        media=media,
-        tables=compile_tables(tables or [_no_table()], joint=traits.joint),
+        media=media._replace(singles=singles),
+        tables=compiled,
         memory=memory,
+        leaps=leaps,
         lights=lights,
         absorption=absorption,
         amounts=len(absorption.least),
@@ -277,18 +310,20 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
     )
 
 
-def _memory(scene: Scene, tables: list[Table]) -> Memory:
-    """Return what level teleport-memory remembers, of nothing where there are no tables."""
+def _memory(scene: Scene, tables: list[Table], chained: bool) -> Memory:
+    """Return what tables remember of entries and, where light goes from sphere to sphere in a chain, packings of their
+    neighbours; of nothing where there are no tables."""
     if not tables:
         return memory_of([], [], [], [])
     laws, grains, at = [], [], 0
     for number, medium in enumerate(scene.media, 1):
         own = tables[at : at + len(medium.grains)]
         at += len(own)
-        try:
-            laws.append(law(medium.packing_fraction))
-        except TSDFError as error:
-            raise SceneError(f"{scene.name}: {called('medium', number, medium.name)}: {error}") from None
+        if chained:
+            try:
+                laws.append(law(medium.packing_fraction))
+            except TSDFError as error:
+                raise SceneError(f"{scene.name}: {called('medium', number, medium.name)}: {error}") from None
         grains.append([(table, grain.fraction) for grain, table in zip(medium.grains, own, strict=True)])
     fractions = [medium.packing_fraction for medium in scene.media]
     return memory_of(laws, fractions, [medium.radius for medium in scene.media], grains)
@@ -331,11 +366,22 @@ def mean_chord(medium: MediumSpec, boundary: Triangles | None) -> float:
     return 4.0 / 3.0 * shape.radius
 
 
-def _long_paths(
+def _gamma(scene: Scene, level: str, leap: float | None) -> float:
+    """Return the smallest radius of leaps in transport mean free paths; UsageError where it cannot be what is asked."""
+    can = LEVELS[level].traits.leaps
+    if leap is None:
+        named = scene.render.leap
+        return (GAMMA if named is None else checked(named)) if can else 0.0
+    if checked(leap) and not can:
+        raise UsageError(f"{scene.name}: level {level} cannot leap, for its grains have their places; leave out leap")
+    return leap
+
+
+def _grains_met(
     scene: Scene, traits: Traits, tables: list[Table], place: Place, parameters: Sequence[VolumeParameters], limit: int
-) -> list[str]:
-    """Return what is to be said of media in which paths meet very many grains; SceneError where they hardly end."""
-    notes, at = [], 0
+) -> list[float]:
+    """Return how many grains a path meets in each medium in the mean, about, until absorption or the limit ends it."""
+    found, at = [], 0
     camera = np.array(scene.camera.position) - place.centre
     for m, (medium, volume) in enumerate(zip(scene.media, parameters, strict=True)):
         own = list(zip(medium.grains, tables[at : at + len(medium.grains)], strict=True))
@@ -347,10 +393,18 @@ def _long_paths(
         inside = bool(place.inside(m, camera[None])[0])
         events = grains_met(medium, place.boundaries[m], inside, extinction, volume.transport_mean_free_path)
         kept = max(
-            table.albedo(_least(grain.absorption, scene.metres_per_unit) * medium.radius) / max(table.albedo(), DARKEST)
+            table.albedo(spectra_of(grain.absorption, scene.metres_per_unit).least * medium.radius)
+            / max(table.albedo(), DARKEST)
             for grain, table in own
         )
-        events = min(events, 1.0 / max(1.0 - kept, DARKEST), limit)  # absorption ends paths
+        found.append(min(events, 1.0 / max(1.0 - kept, DARKEST), limit if limit != MAX_EVENTS else math.inf))
+    return found
+
+
+def _long_paths(scene: Scene, met: Sequence[float]) -> list[str]:
+    """Return what is to be said of media in which paths meet very many grains; SceneError where they hardly end."""
+    notes = []
+    for m, (medium, events) in enumerate(zip(scene.media, met, strict=True)):
         title = called("medium", m + 1, medium.name)
         where = f"{scene.name}: {title}: light meets about {events:.1g} grains in the mean"
         if not events <= ENDLESS:
@@ -405,103 +459,3 @@ def _lights(scene: Scene) -> tuple[LightArrays, list[str]]:
         return compile_lights(constant, environment, rotation, suns), notes
     except TSDFError as error:
         raise SceneError(f"{scene.name}: {error}") from None
-
-
-def _least(spec: AbsorptionSpec, metres_per_unit: float | None) -> float:
-    """Return the least absorption coefficient of any wavelength or channel [1/unit]."""
-    by_wavelength, by_channel = _spectra(spec, metres_per_unit)
-    return float(by_channel.min() if by_wavelength is None else by_wavelength.min())
-
-
-def _spectra(spec: AbsorptionSpec, metres_per_unit: float | None) -> tuple[np.ndarray | None, np.ndarray]:
-    """Return the absorption coefficient by wavelength (k,) or None, and by channel (3,), zero where by wavelength."""
-    if spec.kind == "grey":
-        return None, np.full(3, spec.coefficient[0])
-    if spec.kind == "rgb":
-        return None, np.array(spec.coefficient)
-    return absorption_at(spec, image.spectral_weights().wavelength_nm, metres_per_unit), np.zeros(3)
-
-
-def _media(
-    scene: Scene, traits: Traits, tables: list[Table], limit: int
-) -> tuple[Media, Absorption, tuple[VolumeParameters, ...]]:
-    """Return media, absorption and volume parameters, with amounts only for what absorbs."""
-    specs = [(medium, grain) for medium in scene.media for grain in medium.grains]
-    spectra = [_spectra(grain.absorption, scene.metres_per_unit) for _, grain in specs]
-    coloured = any(by_wavelength is not None for by_wavelength, _ in spectra)
-    weight = image.spectral_weights().weight if coloured else np.zeros((0, 3))
-    absorbs = [by_channel.any() or (s is not None and s.any()) for s, by_channel in spectra]
-
-    free, reach, first, kinds, travel, parameters = [], [], [], [], [], []
-    choice, scale, slots, g = [], [], [], []
-    columns: list[tuple[np.ndarray, np.ndarray]] = []  # exponents by wavelength and by channel of each amount
-
-    def amount(by_wavelength: np.ndarray | None, by_channel: np.ndarray) -> int:
-        columns.append((np.zeros(len(weight)) if by_wavelength is None else by_wavelength, by_channel))
-        return len(columns) - 1
-
-    at = 0
-    for medium in scene.media:
-        these = range(at, at + len(medium.grains))
-        components = [Component(tables[i], specs[i][1].fraction, medium.radius) for i in these]
-        grey = [
-            float(np.array(LUMINANCE) @ (by_channel if s is None else weight.T @ s))
-            for s, by_channel in (spectra[i] for i in these)
-        ]
-        path = free_path(components, medium.packing_fraction)
-        volume = volume_parameters(components, medium.packing_fraction, grey)
-        parameters.append(volume)
-        first.append(at)
-        kinds.append(len(components))
-        choice += list(np.cumsum(path.choice))
-        mean_cosine = volume.g if volume.albedo > 0.0 else 0.0  # where no light leaves a grain any will do
-        g += [mean_cosine] * len(components)
-        if traits.similar:
-            free.append(1.0 / max(volume.sigma_t * (1.0 - mean_cosine), 1.0 / FARTHEST))
-        else:
-            free.append(path.lambda_beta if traits.spheres else 1.0 / volume.sigma_t)
-        reach.append(LONGEST_OFFSET * medium.radius if traits.jumps else 0.0)
-        flown_wavelength, flown_channel = np.zeros(len(weight)), np.zeros(3)
-        for i, probability in zip(these, path.choice, strict=True):
-            scale.append(1.0 if traits.points else medium.radius)
-            if not absorbs[i]:
-                slots.append(-1)
-                continue
-            by_wavelength, by_channel = spectra[i]
-            if traits.points:
-                lossless = tables[i].albedo()
-                spectrum = np.zeros(0) if by_wavelength is None else by_wavelength
-                kept = [
-                    np.array([max(tables[i].albedo(s * medium.radius) / lossless, DARKEST) for s in values])
-                    for values in (spectrum, by_channel)
-                ]
-                slots.append(amount(np.log(kept[0]) if by_wavelength is not None else None, np.log(kept[1])))
-                if by_wavelength is not None:
-                    flown_wavelength -= probability * volume.sigma_t * mean_cosine * (1.0 - kept[0])
-                flown_channel -= probability * volume.sigma_t * mean_cosine * (1.0 - kept[1])
-            else:
-                slots.append(amount(None if by_wavelength is None else -by_wavelength, -by_channel))
-        absorbing = any(absorbs[i] for i in these)
-        travel.append(amount(flown_wavelength, flown_channel) if traits.similar and absorbing else -1)
-        at += len(components)
-    spectral = np.array([c[0] for c in columns]).T.reshape(len(weight), len(columns))
-    rgb = np.array([c[1] for c in columns]).T.reshape(3, len(columns))
-    least = rgb.max(axis=0) + (spectral.max(axis=0) if len(weight) else 0.0)
-    media = Media(
-        traits=traits,
-        free=np.array(free),
-        reach=np.array(reach),
-        first=np.array(first, np.int64),
-        kinds=np.array(kinds, np.int64),
-        travel=np.array(travel, np.int64),
-        choice=np.array(choice),
-        scale=np.array(scale),
-        slot=np.array(slots, np.int64),
-        g=np.array(g),
-        limit=limit,
-    )
-    absorption = Absorption(
-        spectral=np.ascontiguousarray(spectral), rgb=np.ascontiguousarray(rgb), weight=np.ascontiguousarray(weight),
-        least=np.ascontiguousarray(least),
-    )  # fmt: skip
-    return media, absorption, tuple(parameters)

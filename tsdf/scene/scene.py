@@ -15,7 +15,7 @@ import reprlib
 import stat
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from itertools import pairwise
 from numbers import Integral, Real
 from pathlib import Path
@@ -46,6 +46,7 @@ MAX_LIGHTS = 64
 MAX_MEDIA = 64
 MAX_SURFACES = 1000
 MAX_SPHERES = 100_000  # in a tile of the explicit level: a minute to pack
+MAX_EXPLICIT = 1_000_000  # grains met one by one before a chain takes over
 MAX_NAME = 200  # [characters]
 METRES_PER_NM = 1e-9
 ABSORBING = tuple(name for name, medium in MEDIA.items() if medium.k is not None)
@@ -73,6 +74,8 @@ class Render:
     level: str = "teleport"  # one of LEVELS
     spp: int = 64  # samples per pixel
     seed: int = 0
+    leap: float | None = None  # smallest leap [transport mean free paths], 0 for none; None where it is not said
+    explicit_grains: int = 0  # met one by one, the first from the camera, before a chain of grains takes over
 
 
 @dataclass(frozen=True)
@@ -213,6 +216,7 @@ class Scene:
     render: Render = Render()
     metres_per_unit: float | None = None  # [m/unit]; given wherever a grain absorbs as a material does
     name: str = "scene"  # what messages call it
+    folder: str | None = field(default=None, compare=False)  # where its paths start; None if it was made in Python
 
 
 def load(path: str | os.PathLike[str]) -> Scene:
@@ -262,7 +266,7 @@ def parse(data: Mapping[str, Any], folder: str | os.PathLike[str] = ".", name: s
     SceneError
         In one line, with the table, the key and the way out.
     """
-    return replace(_SCENE(data, "the scene", _Place(name, "", Path(folder))), name=name)
+    return replace(_SCENE(data, "the scene", _Place(name, "", Path(folder))), name=name, folder=os.fspath(folder))
 
 
 def called(table: str, number: int, label: str) -> str:
@@ -692,6 +696,22 @@ _SURFACE = _table(
     shape=_section(_tagged(rectangle=_RECTANGLE, mesh=_MESH, box=_BOX, sphere=_SPHERE)),
     reflectance=_colour(1.0),
 )
+
+
+def _leap(value: Any, key: str, at: _Place) -> float:
+    """Read the smallest radius of leaps: 0 for none, else 1 or more."""
+    leap: float = _number(0.0)(value, key, at)
+    if 0.0 < leap < 1.0:
+        at.fail(f"{key} must be 0 (none) or at least 1, not {leap:g}; leaps that short are biased")
+    return leap
+
+
+def _check_render(render: Render, at: _Place) -> Render:
+    if render.leap and not levels.LEVELS[render.level].traits.leaps:
+        at.fail(f"level {render.level} cannot leap, for its grains have their places; leave out leap, or say 0")
+    return render
+
+
 _CAMERA = _table(
     Camera,
     _check_camera,
@@ -708,7 +728,17 @@ _SCENE = _table(
     _check_scene,
     metres_per_unit=_POSITIVE,
     camera=_section(_CAMERA),
-    render=_section(_table(Render, level=_choice(LEVELS), spp=_integer(1, MAX_SAMPLES), seed=_integer())),
+    render=_section(
+        _table(
+            Render,
+            _check_render,
+            level=_choice(LEVELS),
+            spp=_integer(1, MAX_SAMPLES),
+            seed=_integer(),
+            leap=_leap,
+            explicit_grains=_integer(0, MAX_EXPLICIT),
+        )
+    ),
     light=_tables("[[light]]", _LIGHT, MAX_LIGHTS),
     medium=_tables("[[medium]]", _MEDIUM, MAX_MEDIA),
     surface=_tables("[[surface]]", _SURFACE, MAX_SURFACES),

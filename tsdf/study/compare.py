@@ -11,7 +11,7 @@ import io
 import math
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from tsdf.errors import TSDFError, UsageError
 from tsdf.picture import render
 from tsdf.picture.render import Picture
 from tsdf.picture.world import World, build
+from tsdf.scene.levels import LEVELS as MODELS
 from tsdf.scene.scene import LEVELS, Scene
 
 REFERENCES = LEVELS  # best first
@@ -275,78 +276,131 @@ def compare(
             raise UsageError(f"samples and seconds are finite numbers above 0, not {value}")
 
     notes: list[str] = []
-    references: list[Picture] = []
-    rows: list[Row] = []
+    if singles := scene.render.explicit_grains:
+        notes.append(f"the levels that go from grain to grain follow the first {singles} grains as level explicit does")
     level, world = _reference(scene, notes)
     better = REFERENCES[: REFERENCES.index(level)]  # impossible, and noted
     others = [name for name in LEVELS if name in levels and name not in (level, *better)]
     stop = stop or threading.Event()
-    begun, jobs = 0, packings + len(others)
-
-    def shot(world: World, number: int, what: str, spp: int | None, seconds: float | None) -> Picture | None:
-        """Return a picture with random numbers of its own, None if it was stopped before it could be one."""
-        nonlocal begun
-        own = _seed(seed, world.level, number)
-        before, begun = begun, begun + 1
-
-        def part(share: float, word: str) -> None:
-            if progress is not None:
-                progress((before + share) / jobs, f"{what}, {word}")
-
-        part(0.0, "starting")
-        number_of_samples = _affordable(world, spp, seconds, own, threads, stop)
-        picture = render.render(world, number_of_samples, None, None, own, threads, part, stop)
-        return picture if not picture.interrupted or np.isfinite(picture.variance).all() else None
-
-    def packed() -> None:
-        nonlocal world
-        for k in range(packings):
-            if k and level == "explicit" and scene.media:
-                world = build(_repacked(scene, k), level)
-            time = reference_seconds and reference_seconds / packings
-            picture = shot(world, k, f"{level}, picture {k + 1} of {packings}", None if time else spp, time)
-            if picture is not None:
-                references.append(picture)
-                if k == 0 and done is not None:
-                    done(level, world, picture, _seed(seed, level, 0))
-            if stop.is_set():
-                return
-
+    series = _Series(scene, level, notes, seed, threads, packings + len(others), progress, done, stop)
     try:
         try:
-            packed()
+            series.pack(world, packings, spp, reference_seconds)
         finally:  # what there is of it, if it is cut short
-            known = len(references) > 1
-            if references:
-                rows.append(Row(level, pooled(references), _own_noise(references) if known else None))
-            if known and (noise := math.sqrt(_own_noise(references).square_error)) > UNSURE:
-                notes.append(
-                    f"the reference is only known to {100.0 * noise:.2g} % per pixel: give it more seconds or fewer "
-                    "pixels; a small sun it finds by chance alone, a wide one or an environment more easily"
-                )
-            if done is not None and known:
-                spread = np.var([p.rgb for p in references], axis=0, ddof=1) / len(references)
-                done("reference", world, replace(rows[0].picture, variance=spread), _seed(seed, level, 0))
-        lit = any(p.rgb.any() for p in references)
-        if references and not lit:
+            series.sum_up()
+        if series.references and not series.lit:
             notes.append("the reference is black, and nothing is relative to that; give the scene light")
         for name in others:
             if stop.is_set():
                 break
-            try:
-                other = build(scene, name)
-            except TSDFError as error:
-                notes.append(f"{name} is skipped: {error}")
-                begun += 1
-                continue
-            picture = shot(other, 0, name, spp, seconds)
-            if picture is not None:
-                rows.append(Row(name, picture, difference(picture, references) if lit else None))
-                if done is not None:
-                    done(name, other, picture, _seed(seed, name, 0))
+            series.judge(name, spp, seconds)
     except KeyboardInterrupt:
         stop.set()
-    return Comparison(scene, level, len(references), tuple(rows), tuple(dict.fromkeys(notes)), stop.is_set())
+    rows = tuple(series.rows)
+    return Comparison(scene, level, len(series.references), rows, tuple(dict.fromkeys(notes)), stop.is_set())
+
+
+@dataclass(eq=False)
+class _Series:
+    """The pictures of a comparison, one after the other.
+
+    Attributes
+    ----------
+    scene, seed, threads, progress, done, stop
+        As of `compare`.
+    level : str
+        Of the reference.
+    notes : list of str
+    jobs, begun : int
+        Pictures in all, and those begun.
+    world : World
+        Of the reference's last packing.
+    references : list of Picture
+    rows : list of Row
+    """
+
+    scene: Scene
+    level: str
+    notes: list[str]
+    seed: int
+    threads: int | None
+    jobs: int
+    progress: Callable[[float, str], None] | None
+    done: Callable[[str, World, Picture, int], None] | None
+    stop: threading.Event
+    begun: int = 0
+    world: World | None = None
+    references: list[Picture] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
+
+    def pack(self, world: World, packings: int, spp: int | None, seconds: float | None) -> None:
+        """Render the reference with several packings, the first of which is `world`'s, in `seconds` in all."""
+        self.world = world
+        for k in range(packings):
+            if k and self.level == "explicit" and self.scene.media:
+                self.world = build(_taken(_repacked(self.scene, k), self.level), self.level)
+            time = seconds and seconds / packings
+            what = f"{self.level}, picture {k + 1} of {packings}"
+            picture = self._shot(self.world, k, what, None if time else spp, time)
+            if picture is not None:
+                self.references.append(picture)
+                if k == 0:
+                    self._keep(self.level, self.world, picture, self.level)
+            if self.stop.is_set():
+                return
+
+    def sum_up(self) -> None:
+        """Add the reference's row, and what is to be said of it."""
+        level, references = self.level, self.references
+        if not references:
+            return
+        noise = _own_noise(references) if len(references) > 1 else None
+        self.rows.append(Row(level, pooled(references), noise))
+        if noise is not None:
+            if (pixels := math.sqrt(noise.square_error)) > UNSURE:
+                self.notes.append(
+                    f"the reference is only known to {100.0 * pixels:.2g} % per pixel: give it more seconds or fewer "
+                    "pixels; a small sun it finds by chance alone, a wide one or an environment more easily"
+                )
+            assert self.world is not None
+            spread = np.var([p.rgb for p in references], axis=0, ddof=1) / len(references)
+            self._keep("reference", self.world, replace(self.rows[0].picture, variance=spread), level)
+
+    def judge(self, name: str, spp: int | None, seconds: float | None) -> None:
+        """Add the row of another level, or why there is none."""
+        try:
+            world = build(_taken(self.scene, name), name)
+        except TSDFError as error:
+            self.notes.append(f"{name} is skipped: {error}")
+            self.begun += 1
+            return
+        picture = self._shot(world, 0, name, spp, seconds)
+        if picture is not None:
+            self.rows.append(Row(name, picture, difference(picture, self.references) if self.lit else None))
+            self._keep(name, world, picture, name)
+
+    @property
+    def lit(self) -> bool:
+        """Whether the reference has any light."""
+        return any(picture.rgb.any() for picture in self.references)
+
+    def _keep(self, name: str, world: World, picture: Picture, level: str) -> None:
+        if self.done is not None:
+            self.done(name, world, picture, _seed(self.seed, level, 0))
+
+    def _shot(self, world: World, number: int, what: str, spp: int | None, seconds: float | None) -> Picture | None:
+        """Return a picture with random numbers of its own, None if it was stopped before it could be one."""
+        own = _seed(self.seed, world.level, number)
+        before, self.begun = self.begun, self.begun + 1
+
+        def part(share: float, word: str) -> None:
+            if self.progress is not None:
+                self.progress((before + share) / self.jobs, f"{what}, {word}")
+
+        part(0.0, "starting")
+        samples = _affordable(world, spp, seconds, own, self.threads, self.stop)
+        picture = render.render(world, samples, None, None, own, self.threads, part, self.stop)
+        return picture if not picture.interrupted or np.isfinite(picture.variance).all() else None
 
 
 def _affordable(
@@ -380,7 +434,7 @@ def _reference(scene: Scene, notes: list[str]) -> tuple[str, World]:
     first: list[str] = []
     for level in REFERENCES:
         try:
-            world = build(scene, level)
+            world = build(_taken(scene, level), level)
         except TSDFError as error:
             failed = failed or error
             first.append(f"{level} cannot be the reference: {error}")
@@ -389,6 +443,13 @@ def _reference(scene: Scene, notes: list[str]) -> tuple[str, World]:
         return level, world
     assert failed is not None
     raise failed
+
+
+def _taken(scene: Scene, level: str) -> Scene:
+    """Return a scene without the explicit grains that a level cannot take."""
+    if MODELS[level].traits.chains:
+        return scene
+    return replace(scene, render=replace(scene.render, explicit_grains=0))
 
 
 def _repacked(scene: Scene, k: int) -> Scene:

@@ -95,7 +95,8 @@ def exact_hit(kind, shape, p, d):
             if not low < 0.0 < high:
                 return math.inf, False, (0.0, 0.0, 0.0)
             continue
-        a, b = low / d[k], high / d[k]
+        each = 1.0 / d[k]
+        a, b = low * each, high * each
         if d[k] < 0.0:
             a, b = b, a
         if a > near:
@@ -314,23 +315,72 @@ def place(scene: Scene, grains: bool = False) -> Place:
     SceneError
         A boundary that is not a closed, simple surface, media that overlap, a mesh that cannot be read.
     """
-    notes: list[str] = []
-    boundaries: list[Triangles | None] = []
-    for number, medium in enumerate(scene.media, 1):
-        if isinstance(medium.shape, Mesh):
-            mesh, found = _boundary(medium, f"{scene.name}: {called('medium', number, medium.name)}")
-            notes += found
-            boundaries.append(mesh)
-        else:
-            boundaries.append(None)
+    boundaries, notes = _boundaries(scene)
     surfaces = [
         None if isinstance(s.shape, Sphere) else _surface_mesh(s, f"{scene.name}: {called('surface', i, s.name)}")
         for i, s in enumerate(scene.surfaces, 1)
     ]
-
     _check_sizes(scene, boundaries, surfaces)
+    low, high = _ends(scene, boundaries, surfaces)
+    centre = 0.5 * (low + high)
+    boundaries = [m and Triangles(m.vertices - centre, m.faces) for m in boundaries]
+    surfaces = [m and Triangles(m.vertices - centre, m.faces) for m in surfaces]
 
-    # The media's middle is the origin, where float32 is finest
+    kind, shape, slack = _exact_shapes(scene.media, centre)
+    balls = [(i, s.shape) for i, s in enumerate(scene.surfaces) if isinstance(s.shape, Sphere)]
+    places = np.array([[*(np.array(b.centre) - centre), b.radius] for _, b in balls]).reshape(-1, 4)
+    radii = np.array([medium.radius for medium in scene.media])
+    whole = np.array([medium.inside == "grains" for medium in scene.media], bool)
+    room = room_of(kind, _moved(kind, shape, np.where(whole, -radii, 0.0)), radii, whole, places,
+                   _walls(boundaries, surfaces) if grains else [], (low - centre, high - centre))  # fmt: skip
+    if grains:
+        out = np.where(whole, 0.0, radii)
+        shape = _moved(kind, shape, out)
+        boundaries = [m and (_around(m, x) if x else m) for m, x in zip(boundaries, out.tolist(), strict=True)]
+        low, high = low - out.max(initial=0.0), high + out.max(initial=0.0)
+
+    solid = any(mesh is not None for mesh in surfaces)
+    meshes, owners, engine = _ray_meshes(boundaries, surfaces)
+    engines = [triangle_scene(mesh.vertices, mesh.faces) for mesh in meshes]
+    first_facet = [sum(len(mesh.faces) for mesh in meshes[:i]) for i in range(len(meshes))]
+    arrays = Geometry(
+        kind=kind,
+        shape=shape,
+        slack=slack,
+        engine=engine,
+        grid=_grid(meshes, low - centre, high - centre, scene),
+        surface=owners,
+        balls=places,
+        ball_surface=np.array([i for i, _ in balls], np.int32),
+        reflectance=np.array([s.reflectance for s in scene.surfaces], np.float64).reshape(-1, 3),
+        engines=len(engines),
+        solid=solid,
+    )
+    made = Place(arrays, engines, first_facet, centre, boundaries, surfaces, room, notes)
+    _no_overlap(made, scene, grains)
+    return made
+
+
+def _boundaries(scene: Scene) -> tuple[list[Triangles | None], tuple[str, ...]]:
+    """Return the meshes around media, None for exact shapes, and what the user should know of them."""
+    notes: list[str] = []
+    boundaries: list[Triangles | None] = []
+    for number, medium in enumerate(scene.media, 1):
+        mesh = None
+        if isinstance(medium.shape, Mesh):
+            mesh, found = _boundary(medium, f"{scene.name}: {called('medium', number, medium.name)}")
+            notes += found
+        boundaries.append(mesh)
+    return boundaries, tuple(notes)
+
+
+def _ends(
+    scene: Scene, boundaries: Sequence[Triangles | None], surfaces: Sequence[Triangles | None]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest corner of the media, whose middle is the origin, where float32 is finest.
+
+    Where they are endless or there are none, those of the surfaces; else 0.
+    """
     nothing = np.full(3, math.inf)
     low, high = _extent(nothing, -nothing, boundaries)
     for medium in scene.media:
@@ -341,20 +391,17 @@ def place(scene: Scene, grains: bool = False) -> Place:
             low, high = np.minimum(low, centre - radius), np.maximum(high, centre + radius)
         elif isinstance(medium.shape, Slab):
             low[2], high[2] = min(low[2], medium.shape.low), max(high[2], medium.shape.high)
-    if not np.isfinite(low).all():
-        wide, far = _extent(nothing, -nothing, surfaces)
-        low, high = (
-            np.where(np.isfinite(a), a, np.where(np.isfinite(b), b, 0.0)) for a, b in ((low, wide), (high, far))
-        )
-    centre = 0.5 * (low + high)
-    boundaries = [m and Triangles(m.vertices - centre, m.faces) for m in boundaries]
-    surfaces = [m and Triangles(m.vertices - centre, m.faces) for m in surfaces]
+    if np.isfinite(low).all():
+        return low, high
+    wide, far = _extent(nothing, -nothing, surfaces)
+    low, high = (np.where(np.isfinite(a), a, np.where(np.isfinite(b), b, 0.0)) for a, b in ((low, wide), (high, far)))
+    return low, high
 
-    media = len(scene.media)
-    kind, shape, slack = np.zeros(media, np.int32), np.zeros((media, 6)), np.zeros(media)
-    radii = np.array([medium.radius for medium in scene.media])
-    whole = np.array([medium.inside == "grains" for medium in scene.media], bool)
-    for i, medium in enumerate(scene.media):
+
+def _exact_shapes(media: Sequence[MediumSpec], centre: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return kind, shape and slack of media as in `Geometry`, relative to `centre`."""
+    kind, shape, slack = np.zeros(len(media), np.int32), np.zeros((len(media), 6)), np.zeros(len(media))
+    for i, medium in enumerate(media):
         s = medium.shape
         if isinstance(s, Slab):
             kind[i], shape[i, 2], shape[i, 5] = SLAB, s.low - centre[2], s.high - centre[2]
@@ -363,18 +410,16 @@ def place(scene: Scene, grains: bool = False) -> Place:
         elif isinstance(s, Sphere):
             kind[i], shape[i, :3], shape[i, 3] = BALL, s.centre - centre, s.radius
         slack[i] = 1e-9 * max(np.abs(shape[i]).max(), medium.radius)
-    balls = [(i, s.shape) for i, s in enumerate(scene.surfaces) if isinstance(s.shape, Sphere)]
-    places = np.array([[*(np.array(b.centre) - centre), b.radius] for _, b in balls]).reshape(-1, 4)
-    room = room_of(kind, _moved(kind, shape, np.where(whole, -radii, 0.0)), radii, whole, places,
-                   _walls(boundaries, surfaces) if grains else [], (low - centre, high - centre))  # fmt: skip
-    if grains:
-        out = np.where(whole, 0.0, radii)
-        shape = _moved(kind, shape, out)
-        boundaries = [m and (_around(m, x) if x else m) for m, x in zip(boundaries, out.tolist(), strict=True)]
-        low, high = low - out.max(initial=0.0), high + out.max(initial=0.0)
+    return kind, shape, slack
 
-    engines, first_facet, meshes, owners = [], [], [], []
-    facets = 0
+
+def _ray_meshes(
+    boundaries: Sequence[Triangles | None], surfaces: Sequence[Triangles | None]
+) -> tuple[list[Triangles], np.ndarray, np.ndarray]:
+    """Return the meshes of the ray-engine scenes, first that of all surfaces, if any has a mesh, then those of media;
+    the surface (f,) that each facet is of; and the scene (m,) of each medium; NONE where there is none."""
+    meshes: list[Triangles] = []
+    owners: list[np.ndarray] = []
     solid = [(i, mesh) for i, mesh in enumerate(surfaces) if mesh is not None]
     if solid:
         starts = np.cumsum([0] + [len(mesh.vertices) for _, mesh in solid[:-1]])
@@ -384,32 +429,13 @@ def place(scene: Scene, grains: bool = False) -> Place:
         )
         owners.append(np.repeat([i for i, _ in solid], [len(mesh.faces) for _, mesh in solid]))
         meshes.append(united)
-    engine = np.full(media, NONE, np.int32)
+    engine = np.full(len(boundaries), NONE, np.int32)
     for i, boundary in enumerate(boundaries):
         if boundary is not None:
             engine[i] = len(meshes)
             meshes.append(boundary)
             owners.append(np.full(len(boundary.faces), NONE))
-    for mesh in meshes:
-        engines.append(triangle_scene(mesh.vertices, mesh.faces))
-        first_facet.append(facets)
-        facets += len(mesh.faces)
-    arrays = Geometry(
-        kind=kind,
-        shape=shape,
-        slack=slack,
-        engine=engine,
-        grid=_grid(meshes, low - centre, high - centre, scene),
-        surface=np.concatenate(owners).astype(np.int32) if owners else np.zeros(0, np.int32),
-        balls=places,
-        ball_surface=np.array([i for i, _ in balls], np.int32),
-        reflectance=np.array([s.reflectance for s in scene.surfaces], np.float64).reshape(-1, 3),
-        engines=len(engines),
-        solid=bool(solid),
-    )
-    made = Place(arrays, engines, first_facet, centre, boundaries, surfaces, room, tuple(notes))
-    _no_overlap(made, scene, grains)
-    return made
+    return meshes, np.concatenate(owners).astype(np.int32) if owners else np.zeros(0, np.int32), engine
 
 
 def _check_sizes(scene: Scene, boundaries: Sequence[Triangles | None], surfaces: Sequence[Triangles | None]) -> None:

@@ -20,6 +20,7 @@ from tsdf.sampling import GOLDEN, mix, unit
 from tsdf.spheres.neighbours import Law
 from tsdf.vectors import KERNEL, cross, dot, frame, step, triple
 from tsdf.walk.geometry import NONE, clearance, unmet
+from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, leap, missing, patience
 from tsdf.walk.lights import draw as draw_light
 from tsdf.walk.room import MESH, stands
 from tsdf.walk.walker import (
@@ -100,6 +101,21 @@ def upright(t, d):
     return t[0] * half, t[1] * half, t[2] * half
 
 
+@njit(forceinline=True, **KERNEL)
+def sent(grain, d, t):
+    """Return direction, side, impact parameter and normal with which light leaves a sphere, given a record and the
+    direction and side with which it enters it."""
+    up = cross(d, t)
+    x, y, z = float(grain[0]), float(grain[1]), float(grain[2])
+    new = step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d)
+    half = 1.5 - 0.5 * dot(new, new)
+    new = (new[0] * half, new[1] * half, new[2] * half)
+    x, y, z = float(grain[3]), float(grain[4]), float(grain[5])
+    t = upright(step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d), new)
+    b = float(grain[6])
+    return new, t, b, step(step((0.0, 0.0, 0.0), b, t), math.sqrt(max(0.0, 1.0 - b * b)), new)
+
+
 @njit(**KERNEL)
 def begin(w, memory):
     """Draw the sphere that a walker enters next, of which nothing is known: it starts anywhere in the packing."""
@@ -130,6 +146,34 @@ def begin(w, memory):
         w.free = memory.radius[m] * u3 * float(memory.law[m, cell, k, 0])
     write(w.t, t)
     w.b = b
+
+
+@njit(forceinline=True, **KERNEL)
+def sent_on(memory, c, column, u, t, d):
+    """Return what a grain of component c does to light along d that meets it on side t, its impact parameter in that
+    column, by the record that u stands for: direction, side and impact parameter of the exit, path length [R]."""
+    grain = memory.grains[c, column, int(u * memory.kept[c])]
+    up = cross(d, t)
+    x, y, z = float(grain[0]), float(grain[1]), float(grain[2])
+    new = step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d)
+    half = 1.5 - 0.5 * dot(new, new)
+    new = (new[0] * half, new[1] * half, new[2] * half)
+    x, y, z = float(grain[3]), float(grain[4]), float(grain[5])
+    t = upright(step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d), new)
+    return new, t, float(grain[6]), float(grain[7])
+
+
+@njit(**KERNEL)
+def emerge(w, memory, n):
+    """Draw the sphere that a walker enters next, which has just left one where the outward normal is n."""
+    m, d = w.medium, triple(w.d)
+    away = step(n, -dot(n, d), d)
+    b = math.sqrt(dot(away, away))
+    t = (away[0] / b, away[1] / b, away[2] / b) if b > 1e-9 else frame(d)[0]
+    w.key += GOLDEN
+    gap, t, w.b = onward(memory, m, d, t, min(b, 1.0), mix(w.key))
+    write(w.t, t)
+    w.free = memory.radius[m] * gap
 
 
 @njit(**KERNEL)
@@ -186,17 +230,11 @@ def connect(world, batch, w, amounts, p, c, share, bound):
     if media.slot[c] >= 0:
         its_amounts[media.slot[c]] += media.scale[c] * float(grain[7])
     cast(w, shadow, step(centre, radius, n), toward, light, phase / (light_pdf + phase) / share, m, key)
-    away = step(n, -dot(n, toward), toward)
-    b = math.sqrt(dot(away, away))
-    t = (away[0] / b, away[1] / b, away[2] / b) if b > 1e-9 else frame(toward)[0]
-    shadow.key += GOLDEN
-    gap, t, shadow.b = onward(memory, m, toward, t, min(b, 1.0), mix(shadow.key))
-    write(shadow.t, t)
-    shadow.free = radius * gap
+    emerge(shadow, memory, n)
 
 
 @njit(**KERNEL)
-def roam(world, batch, w, amounts, once):
+def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of a walker, in one loop
     """Take a walker in a known medium from sphere to sphere while its flights can meet nothing else; as
     `transport.wander`, but that a shadow ends at the first grain it meets. Returns LOOK, WAIT or ENDED."""
     g, room, media, memory, tables = world.geometry, world.room, world.media, world.memory, world.tables
@@ -210,6 +248,9 @@ def roam(world, batch, w, amounts, once):
     if free < 0.0:
         begin(w, memory)
         t, b, key, free = triple(w.t), w.b, w.key, w.free
+    again = NEVER
+    if not once and not w.shadow:
+        again = patience(world.leaps, m, missing(world.leaps, m, bound))
     while True:
         if not once and bound <= free:
             if not fresh:
@@ -226,6 +267,24 @@ def roam(world, batch, w, amounts, once):
         steps += 1
         p = step(p, free, d)
         bound -= free
+        if steps >= again:
+            write(w.p, p)
+            write(w.d, d)
+            write(w.t, t)
+            w.b, w.key, w.luck, w.pdf = b, key, luck, pdf
+            wait, bound_there = leap(world, batch, w, amounts)
+            again = steps + wait
+            if wait <= LEAPT_ON:
+                p, d, t, b, free = triple(w.p), triple(w.d), triple(w.t), w.b, w.free
+                key, luck, pdf, bound = w.key, w.luck, w.pdf, bound_there
+                if wait == ENDS:
+                    state = ENDED
+                    break
+                if w.events + met >= media.limit:
+                    batch.counters[TRUNCATED] += 1
+                    state = ENDED
+                    break
+                continue
         c = first
         if last > first:
             key += GOLDEN
@@ -248,9 +307,9 @@ def roam(world, batch, w, amounts, once):
         centre = step(step(p, radius * along, d), -radius * b, t)
         column = min(int(b * b * memory.columns[c]), memory.columns[c] - 1)
         there, hit = True, memory.hit[c, column]
-        if not w.shadow:  # its record, should it be met, comes while the room is looked at
-            fetch(memory.grains[c, column, int(unit(mix(key + (TWICE if hit < 1.0 else GOLDEN))) * memory.kept[c])])
         if bound <= 2.0 * radius or not sure:
+            if not w.shadow:  # its record, should it be met, comes while the room is looked at
+                fetch(memory.grains[c, column, int(unit(mix(key + (TWICE if hit < 1.0 else GOLDEN))) * memory.kept[c])])
             if sure:
                 bound = max(bound, clearance(g, m, p))
             if bound <= 2.0 * radius or not sure:
@@ -270,19 +329,11 @@ def roam(world, batch, w, amounts, once):
             met += 1
             u = unit(bits)
             grain = memory.grains[c, column, int(u * memory.kept[c])]
-            up = cross(d, t)
-            x, y, z = float(grain[0]), float(grain[1]), float(grain[2])
             if sampled:
-                pdf = memory.met[c] * density(tables, column_of(tables, c, z))
-                if not pdf > 0.0 or (x == 0.0 and y == 0.0):
+                pdf = memory.met[c] * density(tables, column_of(tables, c, float(grain[2])))
+                if not pdf > 0.0 or (grain[0] == 0.0 and grain[1] == 0.0):
                     pdf = -1.0
-            new = step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d)
-            half = 1.5 - 0.5 * dot(new, new)
-            new = (new[0] * half, new[1] * half, new[2] * half)
-            x, y, z = float(grain[3]), float(grain[4]), float(grain[5])
-            t = upright(step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d), new)
-            d, b = new, float(grain[6])
-            n = step(step((0.0, 0.0, 0.0), b, t), math.sqrt(max(0.0, 1.0 - b * b)), d)
+            d, t, b, n = sent(grain, d, t)
             p = step(centre, radius, n)
             bound -= 2.0 * radius
             slot = media.slot[c]
