@@ -24,12 +24,13 @@ from tsdf.make import scatterometer
 from tsdf.make.scatterometer import Effort
 from tsdf.picture import image, render, world
 from tsdf.scene.scene import Camera, EnvironmentLight, GrainSpec, MediumSpec, Render, Scene, Slab, load, resized
-from tsdf.study.experiment import cuts, gather, slab_experiment
+from tsdf.spheres.packing import pack
+from tsdf.study.experiment import SPHERES, gather, slab_experiment
 from tsdf.walk import transport as T
 
 COUNTS = (0, 1, 2, 3, 5, 7, 10)
 FRACTION = 0.6
-PACKINGS = 4
+PACKINGS, PLACES = 12, 6  # of the slabs: so many heights at which they are cut from a tile hold all its spheres
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 ABOVE = Camera((0.0, 0.0, 50.0), (0.0, 0.0, 0.0), 1, 1, up=(0.0, 1.0, 0.0))
 DOWN, STILL = (0.0, 0.0, -1.0), (0.0, 0.0, 0.0)
@@ -44,11 +45,12 @@ def sphere(eta: float) -> Table:
 
 
 def slabs(effort: float) -> None:
-    """Print R and T of slabs; the spread over packings and places in them is the error of what has single grains."""
+    """Print R and T of slabs; the spread over packings is the error of what has single grains."""
     print("slab, sphere 1.33, f .6 | k | R [%] | of explicit [%] | T [%] | of explicit [%]")
     grain = GrainSpec(sphere(1.33))
     for layer, paths in ((4.0, 4e6), (10.0, 1.2e6), (40.0, 4e5)):
-        places = [(packing, top) for packing in range(PACKINGS) for top in cuts(FRACTION, layer)]
+        side = pack(FRACTION, SPHERES, 0).side
+        places = [(packing, side * i / PLACES) for packing in range(PACKINGS) for i in range(PLACES)]
         each = int(effort * paths / len(places))
 
         def passed(level: str, k: int) -> np.ndarray:
@@ -56,13 +58,13 @@ def slabs(effort: float) -> None:
             for number, (packing, top) in enumerate(places):  # noqa: B023
                 made = slab_experiment(level, grain, FRACTION, layer, 1.0, packing, None, top, k)  # noqa: B023
                 rows.append(gather(made, each, seed=number, threads=1).mean[:2])  # noqa: B023
-            return np.array(rows)
+            return np.reshape(rows, (PACKINGS, PLACES, 2)).mean(axis=1)
 
         truth = passed("explicit", 0)
         mean, n = truth.mean(axis=0), len(truth)
         own = 100.0 * truth.std(axis=0, ddof=1) / math.sqrt(n) / mean
         print(f"{layer:g} R | explicit | {100 * mean[0]:.3f} | ± {own[0]:.2f} | {100 * mean[1]:.3f} | ± {own[1]:.2f}")
-        for k in COUNTS:
+        for k in (0, 1, 2, 5, 10):
             ratio = 100.0 * (passed("teleport-memory", k) - truth) / mean
             off, error = ratio.mean(axis=0), ratio.std(axis=0, ddof=1) / math.sqrt(n)
             found = mean * (1.0 + 0.01 * off)

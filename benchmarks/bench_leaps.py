@@ -6,8 +6,8 @@
 One line for each body: grains met in the mean, events drawn without and with leaps, how many times sooner a path ends;
 and then in per cent what leaps change, with the standard error of the difference: of reflectance R, transmittance T, of
 N, the grains met, of all light that comes out if a grain keeps 99.99 % and 99 % of it, and the total variation of the
-light that comes back over the distance from the beam, with what noise alone makes of it. Of a ball, R is what leaves its
-near half.
+light that comes back over the distance from the beam, with what noise alone makes of it. Of a ball, R is what leaves
+its near half.
 """
 
 import argparse
@@ -85,11 +85,11 @@ def compared(name: str, table: Table, arguments: Any, size: float, ball: bool) -
     variation = 50.0 * np.abs(difference).sum(), 50.0 * math.sqrt(2.0 / math.pi) * both.sum()
     changes = " ".join(
         f"{what} {change[k]:+.2f}({noise[k]:.2f})"
-        for what, k in zip(("R", "T", *map(str, KEPT), "N"), (0, 1, 2, 3, -3))
+        for what, k in zip(("R", "T", *map(str, KEPT), "N"), (0, 1, 2, 3, -3), strict=True)
     )
     return (
-        f"{name}: N {mean[0][-3]:.4g}, drawn {mean[0][-2]:.4g} -> {mean[1][-2]:.3g}, {mean[0][-1] / mean[1][-1]:.2f} times "
-        f"sooner; {changes} profile {variation[0]:.2f} ({variation[1]:.2f})"
+        f"{name}: N {mean[0][-3]:.4g}, drawn {mean[0][-2]:.4g} -> {mean[1][-2]:.3g}, "
+        f"{mean[0][-1] / mean[1][-1]:.2f} times sooner; {changes} profile {variation[0]:.2f} ({variation[1]:.2f})"
     )
 
 

@@ -1,13 +1,15 @@
 """``tsdf-render``: a scene in, a picture out."""
 
 import json
+import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from tsdf.cli.common import LEVELS, Tool, check_numbers, check_output, plain, say, working
+from tsdf.cli.common import LEVELS, Tool, check_numbers, check_output, plain, say, seed_option, threads_option, working
 from tsdf.cli.start import interrupt_status
 
 if TYPE_CHECKING:
@@ -32,14 +34,14 @@ if TYPE_CHECKING:
     "--target-error", type=float, metavar="E",
     help="Stop when the standard error of pixels, over the mean of the picture, is below E instead.",
 )  # fmt: skip
-@click.option("--seed", type=int, metavar="N", help="Of the random numbers, >= 0.  [default: the scene's]")
+@seed_option("the scene's")
 @click.option("--width", type=int, metavar="PIXELS", help="Width of the picture; its shape is kept.")
 @click.option(
     "--leap", type=float, metavar="G",
     help="Take many events in one step where nothing is nearer than G transport mean free paths; 0 never does.  "
     "[default: the scene's, else 2]",
 )  # fmt: skip
-@click.option("--threads", type=int, metavar="N", help="[default: all processors]")
+@threads_option
 @click.option("--quiet", is_flag=True, help="No progress bar, no summary.")
 def main(
     scene: Path, out: Path, level: str | None, explicit_grains: int | None, spp: int | None, seconds: float | None,
@@ -103,7 +105,7 @@ def main(
 
 def save(world: "World", picture: "Picture", seed: int, out: Path) -> None:
     """Write the EXR, with what it was made by as the attribute ``tsdf_render``, and the PNG beside it."""
-    from tsdf.make import estimate
+    from tsdf import files
     from tsdf.picture import image
 
     facts = {
@@ -117,7 +119,7 @@ def save(world: "World", picture: "Picture", seed: int, out: Path) -> None:
         "leaps": picture.leaps,
         "truncated": picture.truncated,
         "faults": picture.faults,
-        "software": estimate.software(),
+        "software": files.software(),
     }
     if singles := world.scene.render.explicit_grains:
         facts["explicit_grains"] = singles
@@ -137,6 +139,24 @@ def summary(world: "World", picture: "Picture", out: Path) -> None:
         f"{picture.relative_error:.2g}, {picture.seconds:.1f} s, {picture.events / max(picture.seconds, 1e-9):.3g} "
         "grain events per second"
     )
+    for line in media(world):
+        say(line)
     lost = picture.truncated + picture.faults
     if lost:
         click.echo(f"warning: {lost} paths were given up ({picture.faults} of them at a fault of a mesh)", err=True)
+
+
+def media(world: "World") -> Iterator[str]:
+    """What the media of a scene hold, in our words and in others', one line each, and the colours asked for."""
+    from tsdf.cli.absorption import conventions
+    from tsdf.scene.scene import called
+
+    for number, (medium, packed) in enumerate(zip(world.scene.media, world.sizes, strict=True), 1):
+        title = called("medium", number, medium.name)
+        yield f"{title}: {packed.summary()}"
+        for grain in medium.grains:
+            if colour := grain.absorption.colour:
+                by_radius = [a * medium.radius for a in grain.absorption.coefficient]
+                same = conventions(by_radius, medium.radius, world.scene.metres_per_unit)
+                deep = "deep" if math.isinf(grain.absorption.thickness) else f"{grain.absorption.thickness:g} thick"
+                yield f"{title}: colour {', '.join(f'{c:g}' for c in colour)} where {deep}: absorption {same}"

@@ -172,7 +172,7 @@ def test_no_grain_is_looked_for(cube: Table) -> None:
     scene = Scene(CAMERA, (ConstantLight((1.0,) * 3),),
                   (MediumSpec(Slab(-4.0, 0.0), 0.4, 1.0, (GrainSpec(replace(cube, header=header)),)),))  # fmt: skip
     assert (render.render(world.build(scene, LEVEL), spp=4, threads=1).rgb == 1.0).all()
-    with pytest.raises(SceneError, match="not built in"):
+    with pytest.raises(SceneError, match="neither built in"):
         world.build(scene, "explicit")
 
 

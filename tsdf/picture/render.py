@@ -250,7 +250,7 @@ def measure(
     free = list(pool)
     begin = time.perf_counter()
 
-    def follow(block: Block) -> np.ndarray:
+    def follow(block: Portion) -> np.ndarray:
         mine = free.pop()
         try:
             return mine.follow(T.Job(camera, block.pixel, block.number, block.sample, seed), block.pixels, halt)
@@ -290,7 +290,7 @@ def measure(
 # ------------------------------------------------------------------------------------- passes, and when to stop
 
 
-class Block(NamedTuple):
+class Portion(NamedTuple):
     """Samples that one thread takes at once: first pixel, pixels, samples of each and the number of the first."""
 
     pixel: int
@@ -299,25 +299,25 @@ class Block(NamedTuple):
     sample: int
 
 
-def _blocks(count: int, done: int, share: int) -> Iterator[Block]:
+def _blocks(count: int, done: int, share: int) -> Iterator[Portion]:
     """Yield the blocks of a pass of `share` samples over `count` pixels, each of which has `done` of them already."""
     size = min(max(share * count // PARTS, LEAST), BLOCK)
     number = min(share, size)
     step = max(1, size // number)
     for sample in range(done, done + share, number):
         for pixel in range(0, count, step):
-            yield Block(pixel, min(step, count - pixel), min(number, done + share - sample), sample)
+            yield Portion(pixel, min(step, count - pixel), min(number, done + share - sample), sample)
 
 
 def _in_turn(
     executor: ThreadPoolExecutor,
-    follow: Callable[[Block], np.ndarray],
-    coming: Iterator[Block],
+    follow: Callable[[Portion], np.ndarray],
+    coming: Iterator[Portion],
     at_once: int,
     stop: threading.Event,
-) -> Iterator[tuple[Block, np.ndarray]]:
+) -> Iterator[tuple[Portion, np.ndarray]]:
     """Yield blocks and what `follow` returns of each, in their order, until `stop` is set; so many are under way."""
-    waiting: deque[tuple[Block, Future]] = deque()
+    waiting: deque[tuple[Portion, Future]] = deque()
     while not stop.is_set():
         while len(waiting) < at_once and (block := next(coming, None)):
             waiting.append((block, executor.submit(follow, block)))
@@ -352,7 +352,7 @@ class Sums:
         """Whether no sample has found light yet."""
         return not self.total.any()
 
-    def add(self, block: Block, radiance: np.ndarray) -> None:
+    def add(self, block: Portion, radiance: np.ndarray) -> None:
         """Add the radiance (pixels, number, 3) of a block."""
         own = slice(block.pixel, block.pixel + block.pixels)
         self.total[own] += radiance.sum(axis=1)

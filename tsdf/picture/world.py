@@ -8,8 +8,9 @@ neighbours are as well), teleport-packed (packed grains, answered by records), e
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import assert_never
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,7 +39,8 @@ from tsdf.scene.scene import (
     SunLight,
     called,
 )
-from tsdf.spheres.neighbours import law
+from tsdf.scene.sizes import MATERIAL_DENSITY, InWords, grain_sizes
+from tsdf.spheres.packing_table import law
 from tsdf.vectors import frame
 from tsdf.walk.explicit import Packed, nothing_packed, packed
 from tsdf.walk.geometry import MESH, Place, Triangles, ball_hit, exact_hit, place
@@ -83,6 +85,8 @@ class World:
         Of the media, at the luminance-weighted mean of their absorption.
     notes : tuple of str
         What the user should know, one line each.
+    sizes : tuple of InWords
+        Of the media, in everybody's words.
     """
 
     scene: Scene
@@ -100,6 +104,7 @@ class World:
     amounts: int
     parameters: tuple[VolumeParameters, ...]
     notes: tuple[str, ...]
+    sizes: tuple[InWords, ...]
 
 
 def camera_of(world: World) -> Camera:
@@ -226,8 +231,8 @@ def build(
     limit : int
         Grains met after which a path is given up; many more, if it is not given, where paths leap over most of them.
     leap : float, optional
-        Radius of the smallest leap in transport mean free paths, 0 for none; else what the scene says, or `GAMMA`, where
-        the level leaps at all.
+        Radius of the smallest leap in transport mean free paths, 0 for none; else what the scene says, or `GAMMA`,
+        where the level leaps at all.
     progress : callable, optional
         Called with the share done and a word about it while records for leaps are made.
 
@@ -307,7 +312,18 @@ def build(
         amounts=len(absorption.least),
         parameters=parameters,
         notes=(*notes, *grains.notes),
+        sizes=tuple(_sizes(scene, tables)),
     )
+
+
+def _sizes(scene: Scene, tables: list[Table]) -> Iterator[InWords]:
+    """Return size and amount of the grains of each medium."""
+    at = 0
+    for medium in scene.media:
+        grains = [(table, grain.fraction) for grain, table in zip(medium.grains, tables[at:], strict=False)]
+        at += len(grains)
+        sizes = grain_sizes(grains, dict(medium.sizes).get(MATERIAL_DENSITY))
+        yield InWords(sizes, medium.packing_fraction, medium.radius, scene.metres_per_unit)
 
 
 def _memory(scene: Scene, tables: list[Table], chained: bool) -> Memory:
@@ -455,6 +471,8 @@ def _lights(scene: Scene) -> tuple[LightArrays, list[str]]:
             environment *= light.scale
             rotation = light.rotation_deg
             notes += [f"{scene.name}: {note}" for note in said]
+        else:
+            assert_never(light)
     try:
         return compile_lights(constant, environment, rotation, suns), notes
     except TSDFError as error:

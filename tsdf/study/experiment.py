@@ -164,9 +164,9 @@ def follow(
         pool.shutdown(cancel_futures=True)
     ends = [one for _, one in found]
     start, place, way, weight, amounts = (np.concatenate([one[k] for one in ends]) for k in range(5))
-    events, drawn, taken = (sum(one[k] for one in ends) for k in range(5, 8))
+    events, drawn = sum(one.events for one in ends), sum(one.drawn for one in ends)
     return np.concatenate([places for places, _ in found]), Ends(
-        start, place, way, weight, amounts, events, drawn, taken
+        start, place, way, weight, amounts, events, drawn, sum(one.seconds for one in ends)
     )
 
 

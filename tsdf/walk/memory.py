@@ -1,6 +1,6 @@
 """Teleportation that remembers its packing: a chain from bounding sphere to bounding sphere.
 
-Where light left one sphere decides where it enters the next. `neighbours` has the law of that, for one packing fraction
+Where light left one sphere decides where it enters the next. `gaps` has the law of that, for one packing fraction
 and any grain; a table's records by entry have what the grain does then. Between the two, the only state is the side of
 the sphere on which light left it and the impact parameter. The packing goes on for ever and only some of its spheres
 hold grains: one that has no room (`room`), or whose grain is missed, is passed straight through, so a flight into a
@@ -17,7 +17,7 @@ from tsdf.compiled import fetch, njit
 from tsdf.data.sampler import column_of, density, turned
 from tsdf.data.table import Table
 from tsdf.sampling import GOLDEN, mix, unit
-from tsdf.spheres.neighbours import Law
+from tsdf.spheres.gaps import Law
 from tsdf.vectors import KERNEL, cross, dot, frame, step, triple
 from tsdf.walk.geometry import NONE, clearance, unmet
 from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, leap, missing, patience

@@ -2,7 +2,8 @@
 
 For a level and what a medium is made of. `leaps` takes many events in one step by them and says what a ball is. They
 are made by the very chain that a walker follows (`transport`, `memory`), in an endless medium, once, and kept in the
-user's cache beside the packings. Lengths are in the level's own unit: R where grains are spheres, else the mean free path.
+user's cache beside the packings. Lengths are in the level's own unit: R where grains are spheres, else the mean free
+path.
 
 The chain is in the state of one that enters the next sphere, or meets the next point, at p along d, at the side t with
 impact parameter b; where it will be in the end is E[p_oo] = M = p + K(b) d + H(b) t. M is a martingale: its steps have
@@ -101,8 +102,8 @@ def component(choice, first, last, u):
 
 @njit(**KERNEL)
 def drawn(chain, m, first, last, seed, sums):
-    """Add up what the mean step needs over draws `first` to `last` of a level that draws free paths: g, z, the square of
-    the offset, and its part along the new direction; lengths in R."""
+    """Add up what the mean step needs over draws `first` to `last` of a level that draws free paths: g, z, the square
+    of the offset, and its part along the new direction; lengths in R."""
     media = chain.media
     begin = media.first[m]
     end = begin + media.kinds[m] - 1
@@ -119,7 +120,8 @@ def drawn(chain, m, first, last, seed, sums):
 
 @njit(forceinline=True, **KERNEL)
 def ended(out, c, p, d, rest):
-    """Write a record: p and d are where and whither the last grain was left, `rest` is (t, b, pending flight, N, radius)."""
+    """Write a record: p and d are where and whither the last grain was left, `rest` is (t, b, pending flight, N,
+    radius)."""
     t, b, s, n, radius = rest
     out[4], out[5], out[6] = b, s, n
     q = step(p, -1.0, c)
