@@ -122,6 +122,7 @@ class Walkers:
         self.grain_starts, self.grain_ways = (np.zeros((exemplars, ROOM, 3), np.float32) for _ in range(2))
         self.counters = np.zeros(6, np.int64)
         self.asked = np.zeros(W.GRAINS_ASKED + exemplars, np.int64)
+        self.spectrum = np.zeros(world.absorption.spectral.shape[1])
         self.radiance = np.zeros((0, 3))
         self.reserve(1)
 
@@ -138,7 +139,7 @@ class Walkers:
             W.Batch(
                 self.walkers[now], self.amounts[now], self.walkers[then], self.amounts[then], self.hits,
                 self.grain_hits, self.starts, self.ways, self.grain_starts, self.grain_ways, self.radiance,
-                self.counters, self.asked,
+                self.counters, self.asked, self.spectrum,
             )
             for now, then in ((0, 1), (1, 0))
         ]  # fmt: skip

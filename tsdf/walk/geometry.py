@@ -84,7 +84,8 @@ def exact_hit(kind, shape, p, d):
             if not low < 0.0 < high:
                 return math.inf, False, (0.0, 0.0, 0.0)
             continue
-        a, b = low / d[k], high / d[k]
+        each = 1.0 / d[k]
+        a, b = low * each, high * each
         if d[k] < 0.0:
             a, b = b, a
         if a > near:
