@@ -79,6 +79,7 @@ def main(
 
     from tsdf.data import format
     from tsdf.loaders import export
+    from tsdf.loaders.pointmedium import point_medium
     from tsdf.scene.deep import absorption_of_colour
     from tsdf.scene.scene import Absorption, absorbing_material
 
@@ -95,14 +96,12 @@ def main(
         spec = Absorption("grey", (products[0] / radius,))
     else:
         spec = Absorption("rgb", tuple(x / radius for x in products))
-    medium = export.bulk(table, packing, radius, spec, unit)
-    measured = export.measure(medium, export.SLAB * radius) if measure else None
+    medium = point_medium(table, packing, radius, spec, unit)
+    measured = export.level_errors(medium, export.SLAB * radius) if measure else None
     told = [grains.summary()]
     if colour:
-        asked = (
-            f"colour {plain(deep_colour)} where {'deep' if colour_thickness is None else f'{colour_thickness:g} thick'}"
-        )
-        told.append(f"{asked}: absorption {conventions(products, radius, unit)}")
+        body = "deep" if colour_thickness is None else f"{colour_thickness:g} thick"
+        told.append(f"colour {plain(deep_colour)} where {body}: absorption {conventions(products, radius, unit)}")
     deep = math.inf if thickness is None else thickness
     request = export.Request(medium, lobes, kept, deep, measured, tuple(told))
     if to == "npz":

@@ -24,7 +24,7 @@ def main(into: Path = INTO) -> None:
         setattr(tsdf, name, getattr(tsdf, name))
     pdoc.render.configure(docformat="numpy", search=True, footer_text=f"tsdf-toolkit {tsdf.__version__}")
     rooms = [f"tsdf.{name}" for _, name, _ in pkgutil.iter_modules([ROOT])]
-    pdoc.pdoc("tsdf", *rooms, "tsdf.loaders.export", output_directory=into)
+    pdoc.pdoc("tsdf", *rooms, "tsdf.loaders.export", "tsdf.loaders.pointmedium", output_directory=into)
 
 
 if __name__ == "__main__":

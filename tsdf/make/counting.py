@@ -27,7 +27,7 @@ class Departed(NamedTuple):
     """Light that left and is still to be counted, in columns.
 
     left (13, n): where it starts for the rim, its direction, where the light entered, its direction, the length inside;
-    notes (3, n) int64: weight, path, key; found (8, n): see `measure`.
+    notes (3, n) int64: weight, path, key; found (8, n): see `deflections`.
     """
 
     left: np.ndarray
@@ -171,7 +171,7 @@ def column(block, row, i):
 
 
 @njit(cache=True, error_model="numpy")
-def measure(count, left, found):
+def deflections(count, left, found):
     """Find cos theta, theta, and r, z, phi_delta forwards and backwards of the first `count` columns of `left`.
 
     A straight loop over arrays becomes vector instructions, five times faster; a ninth row of results, or a branch,
@@ -233,7 +233,7 @@ def count_block(count, block, counts):
     """Count the light of a block's first `count` columns, as it is and walked backwards, which is as likely."""
     left, notes, found, scalars = block.left, block.notes, block.found, counts.scalars
     kept = counts.records.shape[1] > 0 or counts.entry_records.shape[1] > 0
-    measure(count, left, found)
+    deflections(count, left, found)
     for i in range(count):
         p, d, entry, d_in = column(left, 0, i), column(left, 3, i), column(left, 6, i), column(left, 9, i)
         length, weight, path, key = left[12, i], notes[0, i], notes[1, i], np.uint64(notes[2, i])

@@ -6,7 +6,7 @@ from typing import Any
 
 from tsdf.grain.grains import Grain
 from tsdf.grain.optics import Optics
-from tsdf.make.scatterometer import Effort
+from tsdf.make.effort import Effort
 
 
 def printable(text: str) -> str:

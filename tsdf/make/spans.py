@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 
-from tsdf.make.scatterometer import MAX_PATHS
+from tsdf.make.effort import MAX_PATHS
 
 CHUNK_MIN, CHUNK_MAX = 1 << 13, 1 << 20
 Spans = list[tuple[int, int]]  # first and last + 1 path number of each, ascending, none touching the next

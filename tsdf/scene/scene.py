@@ -44,7 +44,7 @@ FARTHEST = 1e15  # [unit] of any coordinate: the ray engine's numbers are float3
 SMALLEST = 1e-12  # [unit] of anything that has a size
 MAX_BYTES = 1_000_000  # of the TOML text
 MAX_SIDE = 65536  # [pixel] along one side of the picture
-MAX_PIXELS = 2**25  # of the picture: two gigabytes while it is made
+MAX_PICTURE = 2**25  # of the picture: two gigabytes while it is made
 MAX_SAMPLES = 2**31 - 1  # per pixel
 MAX_GRAINS = 64  # kinds in all media together, each of which keeps a table in memory
 MAX_LIGHTS = 64
@@ -731,8 +731,8 @@ def _check_camera(camera: Camera, at: _Place) -> Camera:
         at.fail("up has no length; say up = [0, 0, 1]")
     if _parallel(view, up):
         at.fail("up is parallel to the view from position to target; turn it, say up = [0, 1, 0]")
-    if camera.width * camera.height > MAX_PIXELS:
-        at.fail(f"a picture of {camera.width} x {camera.height} has more than {MAX_PIXELS} pixels; make it smaller")
+    if camera.width * camera.height > MAX_PICTURE:
+        at.fail(f"a picture of {camera.width} x {camera.height} has more than {MAX_PICTURE} pixels; make it smaller")
     return camera
 
 
@@ -747,8 +747,8 @@ def resized(scene: Scene, width: int | None) -> Scene:
     if width is None:
         return scene
     height = max(1, round(scene.camera.height * width / scene.camera.width))
-    if width < 1 or width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
-        raise UsageError(f"a width of {width} is out of range: at least 1, at most {MAX_PIXELS} pixels in all")
+    if width < 1 or width * height > MAX_PICTURE or max(width, height) > MAX_SIDE:
+        raise UsageError(f"a width of {width} is out of range: at least 1, at most {MAX_PICTURE} pixels in all")
     return replace(scene, camera=replace(scene.camera, width=width, height=height))
 
 

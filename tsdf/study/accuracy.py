@@ -406,8 +406,14 @@ class _Run:
 def _beside(runs: Sequence[Sums]) -> Sums:
     """Return the numbers of runs one after the other, as if of two paths each, and with their errors."""
     mean, error = np.concatenate([one.mean for one in runs]), np.concatenate([one.error for one in runs])
-    events, drawn = sum(one.events for one in runs), sum(one.drawn for one in runs)
-    return Sums(2, 2.0 * mean, 2.0 * (mean**2 + error**2), events, drawn, sum(one.seconds for one in runs))
+    return Sums(
+        paths=2,
+        total=2.0 * mean,
+        squares=2.0 * (mean**2 + error**2),
+        events=sum(one.events for one in runs),
+        drawn=sum(one.drawn for one in runs),
+        seconds=sum(one.seconds for one in runs),
+    )
 
 
 def _packed(sums: Sequence[Sums]) -> _Found:
