@@ -56,11 +56,14 @@ pictures: .venv/installed
 		$(INTO)/beads_teleport.exr $(INTO)/beads.png
 	$(BIN)/python scenes/plate.py $(INTO)/snow_heap.png $(INTO)/sand_dune.png $(INTO)/beads_explicit.png $(INTO)/scenes.png
 
-test: .venv/installed  ## run the tests
-	$(BIN)/python -m pytest
+JOBS ?= 2
+PYTEST := $(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile
+
+test: .venv/installed  ## run the tests, in two processes; JOBS=4 for more
+	$(PYTEST)
 
 test-fast: .venv/installed  ## run the tests but those that take long
-	$(BIN)/python -m pytest -m "not slow"
+	$(PYTEST) -m "not slow"
 
 check: .venv/installed  ## style and types
 	$(BIN)/ruff check .

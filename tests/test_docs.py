@@ -195,6 +195,7 @@ def test_the_index_lists_all_pages() -> None:
         assert path.name == "index.md" or f"{path.name})" in index, path.name
 
 
+@pytest.mark.slow
 def test_the_reference_shows_what_is_public(tmp_path: Path) -> None:
     """Names that are imported when asked for, and each room; nothing that pdoc warns of."""
     done = subprocess.run([sys.executable, ROOT / "docs" / "reference.py", tmp_path], capture_output=True, text=True)
@@ -215,6 +216,7 @@ def test_scenes_load(path: Path, folder: Path) -> None:
         assert scene.load(folder / f"{i}.toml").media
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "path",
     [path for path in DOCUMENTS if any(kind == "python" for kind, _ in blocks(path))],
@@ -259,6 +261,7 @@ def test_what_is_public_has_an_example() -> None:
         tsdf.reed  # noqa: B018
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++, the C++ compiler, in PATH")
 def test_names_of_the_cpp_page_exist(tmp_path: Path) -> None:
     """Each expression of the tables in docs/cpp.md compiles; a name that does not exist is found out: the control."""

@@ -74,6 +74,7 @@ def test_each_command_says_help_and_version(script: str, installed: Path, tmp_pa
     assert (done.returncode, done.stdout, done.stderr) == (0, f"{script} {PROJECT['project']['version']}\n", "")
 
 
+@pytest.mark.slow
 def test_the_installed_package_works(installed: Path, tmp_path: Path) -> None:
     """A table is built, shown and judged (with reference data), far from the repository; packings are found."""
     where = run(installed / "python", "-c", "import tsdf; print(tsdf.__file__)", cwd=tmp_path)

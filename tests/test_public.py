@@ -1,6 +1,7 @@
 """What `import tsdf` offers beyond reading and writing: the same as the command line does, in one call each."""
 
 import shutil
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -11,19 +12,8 @@ from tsdf.cli.build import main as build
 from tsdf.errors import SceneError, UsageError
 from tsdf.reference_data.make_checks import CHECKS
 
-SCENE = {
-    "camera": {"position": [0, -9, 0], "target": [0, 0, 0], "fov_deg": 30, "width": 6, "height": 4},
-    "render": {"spp": 2, "seed": 5, "level": "volume"},
-    "light": [{"type": "constant", "radiance": [1.0, 0.5, 0.25]}],
-    "medium": [
-        {
-            "shape": {"type": "sphere", "centre": [0, 0, 0], "radius": 1.5},
-            "packing_fraction": 0.4,
-            "radius": 0.05,
-            "grain": [{"table": "cube.tsdf.exr", "absorption": [2.0, 2.0, 4.0]}],
-        }
-    ],
-}
+TEXT = (Path(__file__).parent / "ball.toml").read_text()
+SCENE = {**tomllib.loads(TEXT), "render": {"spp": 2, "seed": 5, "level": "volume"}}
 
 
 @pytest.mark.parametrize("words", [("sphere", "--cells", "32"), ("cube", "--paths", "5000", "--joint", "2")])
@@ -49,14 +39,9 @@ def test_render_takes_scenes_of_all_kinds(tmp_path: Path, monkeypatch: pytest.Mo
     """A file, a dict and a scene give one picture; what is said of the scene holds unless it is said otherwise."""
     shutil.copy(CHECKS / "cube.tsdf.exr", tmp_path)
     monkeypatch.chdir(tmp_path)
-    lines = ["light = [{ type = 'constant', radiance = [1.0, 0.5, 0.25] }]"]
-    lines += ["camera = { position = [0, -9, 0], target = [0, 0, 0], fov_deg = 30, width = 6, height = 4 }"]
-    lines += ["render = { spp = 2, seed = 5, level = 'volume' }", "[[medium]]", "packing_fraction = 0.4"]
-    lines += ["radius = 0.05", "shape = { type = 'sphere', centre = [0, 0, 0], radius = 1.5 }"]
-    lines += ["grain = [{ table = 'cube.tsdf.exr', absorption = [2.0, 2.0, 4.0] }]"]
-    Path("scene.toml").write_text("\n".join(lines))
+    Path("scene.toml").write_text(TEXT.replace("[render]", "[render]\nlevel = 'volume'").replace("spp = 3", "spp = 2"))
     whole = tsdf.render(SCENE)
-    assert whole.rgb.shape == (4, 6, 3) and (whole.samples == 2).all() and whole.rgb.min() < 0.25
+    assert whole.rgb.shape == (8, 12, 3) and (whole.samples == 2).all() and whole.rgb.min() < 0.25
     for scene in ("scene.toml", Path("scene.toml"), tsdf.load_scene("scene.toml")):
         np.testing.assert_array_equal(tsdf.render(scene, threads=1).rgb, whole.rgb)
     small = tsdf.render(SCENE, "isotropic", spp=1, width=3, seed=6)

@@ -46,6 +46,7 @@ def test_sphere(tmp_path: Path) -> None:
     assert table.header["provenance"]["command"] == "tsdf-build sphere --eta 1.33 --fresnel un"
 
 
+@pytest.mark.slow
 def test_the_recorded_command_makes_the_same_bytes(tmp_path: Path) -> None:
     first, second = tmp_path / "1.exr", tmp_path / "2.exr"
     words = [
@@ -115,6 +116,7 @@ def test_progress_says_the_error_and_what_is_left(monkeypatch: pytest.MonkeyPatc
     assert note.startswith("--target-error 0.01 takes about 1.0e+06 paths, 166 minutes more")
 
 
+@pytest.mark.slow
 def test_max_seconds_and_then_more(tmp_path: Path) -> None:
     """The table as good as it got, the paths kept, and from them any other table."""
     out = tmp_path / "x.exr"
@@ -171,6 +173,7 @@ def test_parts_and_merge(tmp_path: Path) -> None:
     assert not (tmp_path / "x.exr").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupt_says_what_is_safe(number: int, tmp_path: Path, launch: Callable[..., subprocess.Popen]) -> None:
     out = tmp_path / "i.tsdf.exr"

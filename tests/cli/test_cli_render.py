@@ -21,28 +21,7 @@ from tsdf.picture import image
 from tsdf.reference_data.make_checks import CHECKS
 
 WIDTH, HEIGHT = 12, 8
-SCENE = f"""
-[camera]
-position = [0.0, -9.0, 0.0]
-target = [0.0, 0.0, 0.0]
-fov_deg = 30.0
-exposure = -1.0
-width = {WIDTH}
-height = {HEIGHT}
-[render]
-spp = 3
-seed = 5
-[[light]]
-type = "constant"
-radiance = [1.0, 0.5, 0.25]
-[[medium]]
-packing_fraction = 0.4
-radius = 0.05
-shape = {{ type = "sphere", centre = [0.0, 0.0, 0.0], radius = 1.5 }}
-[[medium.grain]]
-table = "cube.tsdf.exr"
-absorption = [2.0, 2.0, 4.0]
-"""
+SCENE = (Path(__file__).parents[1] / "ball.toml").read_text()
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +40,27 @@ def run(folder: Path, *words: object, out: str = "p.exr") -> Result:
 
 def facts(path: Path) -> dict:
     return json.loads(image.read_exr(path).attributes["tsdf_render"])
+
+
+def test_an_error_bar_that_cannot_be_trusted(folder: Path) -> None:
+    """Beads under a small sun that level explicit cannot aim at: one line, also when quiet, and in the file; the same
+    under a bright sky are trusted, and nothing is said."""
+    shutil.copy(CHECKS / "sphere.tsdf.exr", folder)
+    beads = SCENE.replace("cube", "sphere").replace("absorption = [2.0, 2.0, 4.0]\n", "")
+    (folder / "trusted.toml").write_text(beads)
+    (folder / "doubted.toml").write_text(
+        beads.replace('type = "constant"\nradiance', 'type = "sun"\ndirection = [0.3, -0.6, 0.7]\nirradiance')
+    )
+    words = ("--level", "explicit", "--quiet", "--spp", "4")
+    for name, trusted in (("trusted", True), ("doubted", False)):
+        out = folder / f"{name}.exr"
+        result = CliRunner().invoke(main, [str(folder / f"{name}.toml"), "--out", str(out), *words])
+        assert (result.exit_code, result.stdout) == (0, "")
+        warned = result.stderr.startswith("warning: the error of the picture cannot be trusted: suns")
+        assert warned == (not trusted) and result.stderr.count("\n") == int(warned)
+        said = facts(out)
+        assert said["trusted"] is trusted and (said["met_by_chance"] is None) == trusted
+        assert {"vov", "slope", "unsure_pixels"} <= set(said)
 
 
 def test_what_is_written(folder: Path) -> None:
@@ -205,6 +205,7 @@ def begin(launch: Callable[..., subprocess.Popen], folder: Path) -> Callable[...
     return lambda *words: launch([str(word) for word in (*command, *words)], stdout=-1, stderr=-1, text=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "times"), [(signal.SIGINT, 1), (signal.SIGTERM, 2)])
 def test_an_interrupt_writes_the_picture_so_far(
     number: int, times: int, begin: Callable[..., subprocess.Popen], tmp_path: Path

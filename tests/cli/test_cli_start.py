@@ -21,6 +21,7 @@ def code(command: str) -> list[str]:
     return [sys.executable, "-c", f"from tsdf.cli.start import {command}; {command}()"]
 
 
+@pytest.mark.slow
 def test_signals_at_random_moments() -> None:
     """The long form is ``python fuzz/signals.py --count 100``."""
     words = ["--count", "6", "--within", "1.2", "--commands", "render,build,validate,compare,plot,packing"]
@@ -95,6 +96,7 @@ def test_an_exception_is_raised_where_asked_for(busy: Callable[..., subprocess.P
     assert [path.name for path in tmp_path.iterdir()] == ["half.txt"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("closed", [(), (0,), (1,), (2,), (0, 1), (1, 2), (0, 1, 2)], ids=str)
 @pytest.mark.parametrize("out", [False, True])
 def test_closed_streams(out: bool, closed: tuple[int, ...], tmp_path: Path) -> None:

@@ -122,6 +122,7 @@ def test_a_newer_minor_version_is_a_warning_of_the_structure():
 # --- sound tables, negative controls ------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "made",
     [
@@ -151,6 +152,7 @@ def test_honest_noisy_tables_pass(made):
     assert errors(traced(**made)) == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("eta", "fresnel"), [(1.31, "un"), (1.5, "sp"), (3.0, "un"), (0.75, "sp"), (1.0, "un")])
 @pytest.mark.parametrize("memory", [1, 32])
 def test_records_by_entry_of_exact_spheres_pass(eta, fresnel, memory):

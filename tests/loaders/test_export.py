@@ -132,6 +132,7 @@ def reflectance(sigma_a: float, sigma_s: float, moments: np.ndarray, thickness: 
 # ----------------------------------------------------------------------------------------------- numbers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("products", [(0.0,) * 3, (0.05,) * 3, (0.001, 0.02, 0.3)])
 def test_every_target_has_the_numbers_of_the_medium(cube: Table, products: tuple[float, float, float]) -> None:
     """Read back by each renderer's own rules, sigma_s and sigma_a are those of `volume_parameters`; g is within range.
@@ -239,6 +240,7 @@ def test_black_grains(ball: Table) -> None:
 # ------------------------------------------------------------------------------------------- put back
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("product", [0.0, 0.02])
 def test_rendering_what_was_written_gives_the_level(ball: Table, product: float) -> None:
     """A slab of 40 R of the exported numbers, by discrete ordinates, reflects as our level volume-hg does.

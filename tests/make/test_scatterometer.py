@@ -109,6 +109,7 @@ def test_few_paths_leave_no_record_without_light(octahedron: Grain) -> None:
     assert b2.min() > -1e-3 and b2.max() < 1.0 + 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("eta", "fresnel"), [(1.33, "un"), (1.5, "sp"), (0.75, "un"), (1.0, "un")])
 def test_records_by_entry_of_the_exact_sphere(eta: float, fresnel: str) -> None:
     """They have the statistics of the sphere, by quadrature: 32 x 258 of them are within 2e-3.
@@ -205,6 +206,7 @@ def test_a_table_as_good_as_it_got(octahedron: Grain) -> None:
     assert np.array_equal(table.pixels, own.pixels) and table.header == own.header
 
 
+@pytest.mark.slow
 def test_kill_loses_no_more_than_a_few_seconds(
     octahedron: Grain, tmp_path: Path, launch: Callable[..., subprocess.Popen]
 ) -> None:
@@ -385,6 +387,7 @@ def test_unreachable_target_is_refused(octahedron: Grain) -> None:
     assert finest.paths < 1_000_000
 
 
+@pytest.mark.slow
 def test_stated_errors_are_those_of_repeated_builds() -> None:
     """Forty builds with other seeds scatter as much as each says it does.
 
@@ -473,6 +476,7 @@ SOLIDS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "parameters", "eta", "geometry", "optics", "error", "atom"), SOLIDS)
 def test_convex_solids(name, parameters, eta, geometry, optics, error, atom) -> None:  # type: ignore[no-untyped-def]
     """Two routes to each number: Cauchy's theorems and other people's rays."""
@@ -513,6 +517,7 @@ def test_absorption_of_a_mesh_follows_the_sphere() -> None:
         assert table.mean_cosine(absorption) == pytest.approx(truth.mean_cosine, abs=0.006)
 
 
+@pytest.mark.slow
 def test_icospheres_converge_to_the_sphere() -> None:
     """The total variation of the density falls as the root of the number of faces, first order in the edge length.
 
@@ -599,6 +604,7 @@ def test_means_lie_in_their_cells(tmp_path: Path) -> None:
     assert table.block("mean_l")[24, -2] == 1.4375 != round(5 * 1.45) / 5  # the upper edge of its cell
 
 
+@pytest.mark.slow
 def test_random_builds_are_not_lost(tmp_path: Path) -> None:
     """A few of the builds of `fuzz/builds.py`, of which 0 of 2,000 may be lost."""
     place = Path(__file__).parents[2] / "fuzz" / "builds.py"
@@ -609,6 +615,7 @@ def test_random_builds_are_not_lost(tmp_path: Path) -> None:
     assert [why for number in range(8) if (why := builds.lost(number, tmp_path))] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "environment",
     [{"OMP_NUM_THREADS": n, "OPENBLAS_NUM_THREADS": n} for n in "123"]

@@ -65,6 +65,7 @@ def test_records_by_entry_change_nothing_else() -> None:
     assert having.memory == T.LEAST
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sphere", "cube", "tetrahedron", "sand", "snow"])
 @pytest.mark.parametrize("plain", [False, True])
 def test_no_energy_is_made_or_lost(name: str, plain: bool) -> None:
@@ -252,6 +253,7 @@ def test_hits_by_entry_of_a_cube() -> None:
     assert hit.mean() == pytest.approx(2.0 / math.pi, abs=4.0 * math.sqrt(spread.mean() / paths))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sphere", "cube", "snow"])
 def test_as_much_light_enters_backwards_as_forwards(name: str) -> None:
     """What the records stand for is twice the light that met the grain in their cell: two unrelated counts.
@@ -307,6 +309,7 @@ def test_records_by_entry_of_a_sphere() -> None:
     assert squares[1.33] < 1.0 + 4.0 * math.sqrt(2.0 / (4 * columns)) and squares[1.40] > 3.0, squares
 
 
+@pytest.mark.slow
 def test_handedness() -> None:
     """A grain and its mirror image have opposite azimuths: a propeller is not its own mirror image.
 
@@ -369,6 +372,7 @@ def test_conventions_are_told_apart() -> None:
     assert np.abs(z).max() > 8.0 and chi_square > 3.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["snow", "hexprism"])
 def test_both_estimators_agree(name: str) -> None:
     """Splitting, fans, horizons and Sobol' points change the noise and nothing else."""

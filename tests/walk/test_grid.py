@@ -58,6 +58,7 @@ def floor(z: float, size: float) -> np.ndarray:
     return np.array([[a, b, c], [a, c, d]], np.float64)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cells", [1, 60, 3000, 200_000])
 def test_first_facets(cells: int) -> None:
     """A dented ball over a floor that reaches far out of the grid: from anywhere, near and far, and short."""

@@ -189,7 +189,7 @@ def test_furnace_of_sampled_light(shape, level, folder, ball):
 def test_furnace_notices_a_loss(folder, ball):
     """Negative control: grains that take 1e-3 of the light that goes through them fail the furnace's test."""
     scene = scene_of([Slab(-4.0, 4.0)], ball, lights=under(folder, "white"))
-    grain = replace(scene.media[0].grains[0], absorption=world.AbsorptionSpec("grey", (3e-3,)))
+    grain = replace(scene.media[0].grains[0], absorption=Absorption("grey", (3e-3,)))
     picture = take(replace(scene, media=(replace(scene.media[0], grains=(grain,)),)), "teleport", 64)
     mean, error = mean_of(picture)
     assert abs(mean - 1.0) > 4.0 * error
@@ -285,6 +285,7 @@ def meshed(scene: Scene, folder: Path) -> Scene:
     return replace(scene, media=(replace(medium, shape=Mesh(folder / "as_mesh.ply")),))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", JUMPING)
 @pytest.mark.parametrize("boundary", ["exact", "mesh"])
 @pytest.mark.parametrize("name", LEAKS)

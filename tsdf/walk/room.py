@@ -23,11 +23,11 @@ CLOSED, OPEN = -2, -1  # owners of the facets of opaque surfaces; a medium's are
 class Room(NamedTuple):
     """What kernels ask about the room for grains; coordinates as in `geometry.Geometry`.
 
-    kind (m,), shape (m, 6): where centres may lie, if that is no mesh; radius (m,): R [unit]; whole (m,) bool: bounding
-    spheres lie wholly inside a mesh; balls (b, 4): opaque; corners (f, 3, 3), owner (f,) of facets; planes (f, 5): their
-    normal, height over the origin, and how far the corners are from it, with rounding; first (cells + 1,), facets:
-    those that come within R of a cell, one cell after the other; inside (m + 1, cells) bool: whether a cell's middle is
-    in each medium with a mesh and, last, in a closed surface; low (3,), edge, counts (3,): the grid.
+    kind (m,), shape (m, 6): where centres may lie, if that is no mesh; radius (m,): R [unit]; whole (m,) bool:
+    bounding spheres lie wholly inside a mesh; balls (b, 4): opaque; corners (f, 3, 3), owner (f,) of facets; planes
+    (f, 5): their normal, height over the origin, and how far the corners are from it, with rounding; first (cells +
+    1,), facets: those that come within R of a cell, one cell after the other; inside (m + 1, cells) bool: whether a
+    cell's middle is in each medium with a mesh and, last, in a closed surface; low (3,), edge, counts (3,): the grid.
     """
 
     kind: np.ndarray
