@@ -100,10 +100,8 @@ def main(
     measured = export.level_errors(medium, export.SLAB * radius) if measure else None
     told = [grains.summary()]
     if colour:
-        asked = (
-            f"colour {plain(deep_colour)} where {'deep' if colour_thickness is None else f'{colour_thickness:g} thick'}"
-        )
-        told.append(f"{asked}: absorption {conventions(products, radius, unit)}")
+        body = "deep" if colour_thickness is None else f"{colour_thickness:g} thick"
+        told.append(f"colour {plain(deep_colour)} where {body}: absorption {conventions(products, radius, unit)}")
     deep = math.inf if thickness is None else thickness
     request = export.Request(medium, lobes, kept, deep, measured, tuple(told))
     if to == "npz":

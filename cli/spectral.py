@@ -173,9 +173,7 @@ def packing_of(family: "Family", material: str, density: float) -> float:
     from tsdf.scene.sizes import DENSITIES, convert
 
     said = {"density": density} | ({"material_density": DENSITIES[material]} if material in DENSITIES else {})
-    found = convert([(family.tables[0], 1.0)], said).packing_fraction
-    assert found is not None  # it is what was asked for
-    return found
+    return convert([(family.tables[0], 1.0)], said).fraction
 
 
 def check(asked: Asked, *outputs: Path | None) -> None:
