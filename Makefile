@@ -56,13 +56,23 @@ pictures: .venv/installed
 		$(INTO)/beads_teleport.exr $(INTO)/beads.png
 	$(BIN)/python scenes/plate.py $(INTO)/snow_heap.png $(INTO)/sand_dune.png $(INTO)/beads_explicit.png $(INTO)/scenes.png
 
-test: .venv/installed  ## run the tests
-	$(BIN)/python -m pytest
+JOBS ?= 2
+PYTEST := $(BIN)/python -m pytest --numprocesses $(JOBS) --dist loadfile
+
+test: .venv/installed  ## run the tests, in two processes; JOBS=4 for more
+	$(PYTEST)
+
+test-fast: .venv/installed  ## run the tests but those that take long
+	$(PYTEST) -m "not slow"
 
 check: .venv/installed  ## style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+docs: .venv/installed  ## make the API reference, into reference/
+	$(BIN)/python docs/reference.py
+	@echo "open reference/index.html; docs/index.md lists all pages"
 
 bench: .venv/installed  ## measure speed and error side by side, into bench/
 	$(BIN)/python benchmarks/bench.py
@@ -75,4 +85,4 @@ fuzz: .venv/installed  ## throw damaged and hostile files and signals at everyth
 	for name in $(FUZZERS); do \
 		$(BIN)/python fuzz/$$name.py $(if $(COUNT),--count $(COUNT)) --seed $(or $(SEED),0) || exit; done
 
-.PHONY: help install demo tables gallery pictures test check bench fuzz
+.PHONY: help install demo tables gallery pictures test test-fast check docs bench fuzz

@@ -21,8 +21,8 @@ import tsdf
 from tsdf.grain.grains import Grain, embree_scene, load_grain
 from tsdf.grain.optics import Optics
 from tsdf.judge import analytic
-from tsdf.make import estimate
 from tsdf.make.scatterometer import Build, Effort, exact_sphere
+from tsdf.make.statistics import cos_theta_edges, table_error
 from tsdf.make.tally import Tally
 from tsdf.make.tracer import Tracer, in_order
 
@@ -90,14 +90,14 @@ def errors(grain: Grain, plain: bool, doublings: int, first: int) -> list[tuple[
         more = in_order(done, first << k)
         spent += seconds(lambda more=more: made.trace(more, tally))  # type: ignore[misc]
         done = first << k
-        points.append((done, spent, estimate.table_error(tally, CELLS).sampling_noise))
+        points.append((done, spent, table_error(tally, CELLS).sampling_noise))
     return points
 
 
 def honesty(paths: list[int]) -> list[tuple[int, float, float]]:
     """Return paths, stated and true total variation of p_theta of the traced sphere, noise alone."""
     sphere, rows = load_grain("sphere"), []
-    truth = analytic.deflection_masses(estimate.cos_theta_edges(CELLS)[1:-1], 1.33, "un")
+    truth = analytic.deflection_masses(cos_theta_edges(CELLS)[1:-1], 1.33, "un")
     for count in paths:
         build = Build.start(sphere, Optics(1.33), Effort(paths=count, cells=CELLS))
         build.run(sphere, 2)

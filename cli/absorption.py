@@ -5,6 +5,7 @@ tables have it (`absorption_times_radius`), which needs no length. A number says
 """
 
 import math
+from collections.abc import Sequence
 
 from tsdf.cli.common import plain
 from tsdf.errors import UsageError
@@ -56,3 +57,21 @@ def times_radius(
     if not all(math.isfinite(x) for x in products):
         raise UsageError(f"--absorption {plain(text)} times the bounding radius is out of the range of numbers")
     return products
+
+
+def conventions(products: Sequence[float], radius: float | None, unit: float | None) -> str:
+    """Return an absorption coefficient, one number or one per colour, in every convention that the lengths allow.
+
+    Parameters
+    ----------
+    products : sequence of float
+        sigma_a R [1].
+    radius : float or None
+        Bounding radius R [scene unit].
+    unit : float or None
+        Length of the scene unit [m].
+    """
+    by = {"R": 1.0} | ({} if radius is None else {"unit": 1.0 / radius})
+    by |= {} if radius is None or unit is None else {"m": 1.0 / (radius * unit)}
+    different = products if len(set(products)) > 1 else products[:1]
+    return " = ".join(f"{', '.join(f'{x * factor:.4g}' for x in different)} / {name}" for name, factor in by.items())

@@ -4,10 +4,21 @@ from pathlib import Path
 
 import click
 
-from tsdf.cli.common import Tool, check_folder, check_numbers, named_levels, plain, say, working
+from tsdf.cli.common import (
+    Tool,
+    check_folder,
+    check_numbers,
+    named_levels,
+    plain,
+    say,
+    seed_option,
+    threads_option,
+    working,
+    write_text,
+)
 from tsdf.cli.start import interrupt_status, interrupted, interruptible
 
-MEASURED = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume")
+MEASURED = ("explicit", "teleport-packed", "teleport-memory", "teleport-joint", "teleport", "volume")
 
 
 @click.command("tsdf-accuracy", cls=Tool)
@@ -31,9 +42,11 @@ MEASURED = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume
     help="Time of measuring, after a start that makes packings and compiles once for this machine.  [default: 300]",
 )  # fmt: skip
 @click.option("--paths", type=int, metavar="N", help="Paths of each slab, level and packing instead.")
-@click.option("--packings", type=int, default=4, metavar="K", show_default=True, help="Packings behind explicit.")
-@click.option("--seed", type=int, default=0, metavar="N", show_default=True, help="Of the random numbers, >= 0.")
-@click.option("--threads", type=int, metavar="N", help="[default: all processors]")
+@click.option(
+    "--packings", type=int, default=4, metavar="K", show_default=True, help="Packings behind levels of packed grains."
+)
+@seed_option("0")
+@threads_option
 @click.option("--quiet", is_flag=True, help="No progress bar, no table.")
 def main(
     table: Path, out: Path, packing: tuple[float, ...], layer: tuple[float, ...], levels: str | None,
@@ -53,11 +66,12 @@ def main(
     check_numbers(seed, threads=threads)
 
     from tsdf.data import format
-    from tsdf.files import replacing
     from tsdf.scene.scene import GrainSpec
     from tsdf.study import accuracy, plots
+    from tsdf.walk.explicit import mesh_beside
 
     read = format.read(table)
+    mesh = mesh or mesh_beside(read, [table.parent])
     meshes = [] if mesh is None else [mesh]
     check_folder(out, ["accuracy.md", "accuracy.csv", "accuracy.png"], table, *meshes)
     with working(quiet) as work:
@@ -76,8 +90,7 @@ def main(
         except SceneError as error:
             raise TSDFError(f"{error} (--mesh FILE)" if mesh is None else str(error)) from None
         for name, text in (("accuracy.md", accuracy.markdown(found)), ("accuracy.csv", accuracy.csv_text(found))):
-            with replacing(out / name) as temporary:
-                temporary.write_text(text, encoding="utf-8")
+            write_text(out / name, text)
         if found.rows:
             plots.save(plots.plot_accuracy(accuracy.facts(found), found.fraction, found.name), out / "accuracy.png")
     if not quiet:

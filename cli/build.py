@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsdf.cli.common import Progress, Tool, check_numbers, check_output, plain, say, shown_progress, whole_number
+from tsdf.cli.common import (
+    Progress,
+    Tool,
+    check_numbers,
+    check_output,
+    plain,
+    say,
+    seed_option,
+    shown_progress,
+    threads_option,
+    whole_number,
+)
 from tsdf.cli.start import interrupt_status, interruptible
 from tsdf.errors import GrainError, TSDFError, UsageError
 
@@ -138,9 +149,7 @@ def told(progress: Progress, target: float | None) -> Callable[["Done"], None]:
     show_default=True,
     help="Records per cell of entry, which level teleport-memory draws from; 64 are many enough.",
 )
-@click.option(
-    "--seed", callback=whole_number, default="0", metavar="N", show_default=True, help="Seed of the random numbers."
-)
+@seed_option("0")
 @click.option(
     "--max-bounces",
     callback=whole_number,
@@ -149,9 +158,7 @@ def told(progress: Progress, target: float | None) -> Callable[["Done"], None]:
     show_default=True,
     help="Hits before a path is cut.",
 )
-@click.option(
-    "--threads", callback=whole_number, metavar="N", help="Threads; the result does not depend on it.  [default: all]"
-)
+@threads_option
 @click.option("--repair", is_flag=True, help="Try to close an open mesh, and say what that changed.")
 @click.option("--repair-any", is_flag=True, help="As --repair, even if more than a tenth of the surface is new.")
 @click.option("--chunk", "part", callback=_part, metavar="i/n", help="Trace part i of n only; --out is for tsdf-merge.")

@@ -11,9 +11,9 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import click
 
@@ -23,6 +23,7 @@ from tsdf.errors import TSDFError, UsageError
 from tsdf.scene import levels
 
 LEVELS = tuple(levels.LEVELS)
+F = TypeVar("F", bound=Callable[..., Any])
 MOST_THREADS = 1024
 EVERY_S = 60.0  # [s] between lines of progress where no terminal shows a bar
 LEAST_S = 0.1  # [s] between two looks of a bar
@@ -42,8 +43,28 @@ def plain(value: Any) -> str:
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
+def _say_version(context: click.Context, _: click.Parameter, value: bool) -> None:
+    if value and not context.resilient_parsing:
+        import tsdf
+
+        click.echo(f"{context.command.name} {tsdf.__version__}")
+        context.exit()
+
+
 class Tool(click.Command):
-    """A click command whose errors are one line, ``NAME: error: ...``; the callback may return an exit status."""
+    """A click command whose errors are one line, ``NAME: error: ...``; the callback may return an exit status.
+
+    Each has --version.
+    """
+
+    def __init__(self, *words: Any, **given: Any) -> None:
+        super().__init__(*words, **given)
+        self.params.append(
+            click.Option(
+                ["--version"], is_flag=True, is_eager=True, expose_value=False, callback=_say_version,
+                help="Show the version and exit.",
+            )
+        )  # fmt: skip
 
     def main(
         self, args: Sequence[str] | None = None, prog_name: str | None = None, *rest: Any, **extra: Any
@@ -146,6 +167,14 @@ def check_output(out: Path, *inputs: Path, beside: Iterable[Path] = (), part: bo
             files.probe(path)
         except OSError as error:
             raise TSDFError(f"cannot write {shown}: {error.strerror or error}; choose another --out") from None
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write a text, whole or not at all."""
+    from tsdf.files import replacing
+
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def _same(one: Path, other: Path) -> bool:
@@ -301,6 +330,19 @@ def whole_number(context: click.Context, parameter: click.Parameter, value: str 
     except (ValueError, OverflowError):
         pass
     raise click.BadParameter(f"{value!r} is not a whole number", context, parameter)
+
+
+threads_option = click.option("--threads", callback=whole_number, metavar="N", help="[default: all processors]")
+
+
+def seed_option(default: str) -> Callable[[F], F]:
+    """Return the option --seed, of the random numbers; its default is a number, or in words where it is found later."""
+    number = default if default.isdecimal() else None
+    said = "" if number else f"  [default: {default}]"
+    return click.option(
+        "--seed", callback=whole_number, metavar="N", default=number, show_default=bool(number),
+        help=f"Of the random numbers, >= 0.{said}",
+    )  # fmt: skip
 
 
 def check_numbers(seed: int | None = None, threads: int | None = None, **counts: int | None) -> None:

@@ -5,7 +5,19 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsdf.cli.common import LEVELS, Tool, check_folder, check_numbers, named_levels, plain, say, working
+from tsdf.cli.common import (
+    LEVELS,
+    Tool,
+    check_folder,
+    check_numbers,
+    named_levels,
+    plain,
+    say,
+    seed_option,
+    threads_option,
+    working,
+    write_text,
+)
 from tsdf.cli.render import save
 from tsdf.cli.start import interrupt_status
 
@@ -29,8 +41,8 @@ if TYPE_CHECKING:
 )  # fmt: skip
 @click.option("--packings", type=int, default=4, metavar="K", help="Packings behind the reference.  [default: 4]")
 @click.option("--width", type=int, metavar="PIXELS", help="Width of the pictures; their shape is kept.")
-@click.option("--seed", type=int, metavar="N", help="Of the random numbers, >= 0.  [default: the scene's]")
-@click.option("--threads", type=int, metavar="N", help="[default: all processors]")
+@seed_option("the scene's")
+@threads_option
 @click.option("--quiet", is_flag=True, help="No progress bar, no table.")
 def main(
     scene: Path, out: Path, levels: str | None, spp: int | None, seconds: float | None,
@@ -46,7 +58,6 @@ def main(
     chosen = named_levels(levels, LEVELS)
     check_numbers(seed, spp=spp, width=width, threads=threads)
 
-    from tsdf.files import replacing
     from tsdf.scene.scene import files_of, load, resized
     from tsdf.study import compare, plots
 
@@ -63,8 +74,7 @@ def main(
             threads, work.told, keep, work.stop,
         )  # fmt: skip
         for name, text in (("levels.md", compare.markdown(found)), ("levels.csv", compare.csv_text(found))):
-            with replacing(out / name) as temporary:
-                temporary.write_text(text, encoding="utf-8")
+            write_text(out / name, text)
         if found.pictures > 1:
             plots.save(plots.plot_levels(compare.facts(found), found.reference, found.scene.name), out / "levels.png")
     if not quiet:

@@ -7,13 +7,26 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tsdf.cli.common import Tool, plain
+from tsdf.cli.common import LEVELS, Tool, plain
+from tsdf.cli.sizes import colour_of, coloured, in_words, said, sized
 
 if TYPE_CHECKING:
-    from tsdf.data.table import Table
+    from tsdf.data.table import Measured, Table
+    from tsdf.scene.sizes import InWords
 
 LENGTHS = ("lambda_b", "lambda_beta", "lambda_s")  # of the medium
 COEFFICIENTS = ("sigma_t", "sigma_s", "sigma_a")
+OTHERS = {  # what others call it: unit with a radius said, unit without, a word about it
+    "absorption_enhancement": ("", "", "B"),
+    "single_scattering_albedo": ("", "", ""),
+    "asymmetry_factor": ("", "", "geometrical optics"),
+    "asymmetry_factor_far_field": ("", "", "with diffraction"),
+    "effective_radius": ("units", "R", "3 V / (4 projected area)"),
+    "projected_area": ("units^2", "R^2", ""),
+    "dark_share": ("", "", "of directions inside that no light reaches"),
+}
+SIZE_UNITS = {"ssa": "m2/kg", "density": "kg/m3", "material_density": "kg/m3"}  # of what is not a length
+SIZE_UNITS |= {"packing_fraction": "", "solid_fraction": ""}
 UNITS = {"mean_z": "R", "mean_r": "R", "mean_miss_chord": "R", "mean_path_length": "R"}
 
 
@@ -27,37 +40,52 @@ UNITS = {"mean_z": "R", "mean_r": "R", "mean_miss_chord": "R", "mean_path_length
     "--radius, X/mm (um, cm, m) per length, with --radius and --unit. Albedo and mean cosine are then those of the "
     "absorbing grain.  [default: 0]",
 )
+@sized
+@coloured
 @click.option(
-    "--packing",
-    type=float,
-    metavar="F",
-    help="Share of a volume filled by bounding spheres [1], 0 < F <= 0.74; adds the medium of such grains.",
+    "--unit", type=float, metavar="METRES", help="Length of the unit of --radius; X/mm (um, cm, m) and --ssa need it."
 )
 @click.option(
-    "--radius",
-    type=float,
-    metavar="L",
-    help="Bounding radius of the grains in that medium, whose lengths are then in the unit of L.  [default: in R]",
+    "--render-colour",
+    "level",
+    type=click.Choice(LEVELS),
+    help="Render the medium of that colour at a level, too (a minute), and say which absorption has it there.",
 )
-@click.option("--unit", type=float, metavar="METRES", help="Length of the unit of L; only X/mm (um, cm, m) needs it.")
 def main(
-    file: str, as_json: bool, absorption: str | None, packing: float | None, radius: float | None, unit: float | None
-) -> None:
-    """Show what the table FILE holds: grain, optics, statistics with standard errors, errors, energy, origin."""
+    file: str, as_json: bool, absorption: str | None, unit: float | None, deep_colour: str | None,
+    colour_thickness: float | None, level: str | None, **options: float | None,
+) -> None:  # fmt: skip
+    """Show what the table FILE holds: grain, optics, statistics with standard errors, errors, energy, origin.
+
+    With sizes and amounts, in any of the words of docs/sizes.md, what grains of that size and media of that amount are;
+    with a colour, the absorption that gives it.
+    """
     from tsdf.cli.absorption import times_radius
     from tsdf.data import format
     from tsdf.errors import UsageError
+    from tsdf.scene.sizes import SIZES
 
-    if radius is not None and packing is None and absorption is None:
-        raise UsageError("--radius is of the grains of a medium: give its --packing too")
-    for name, value in (("--radius", radius), ("--unit", unit)):
+    words, colour = said(options), colour_of(deep_colour)
+    if absorption is not None and colour:
+        raise UsageError("--absorption and --deep-colour both say how grains absorb: give one")
+    for name, value in (("--unit", unit), ("--colour-thickness", colour_thickness)):
         if value is not None and not 0.0 < value < math.inf:
             raise UsageError(f"{name} is a finite number > 0, not {value:g}")
-    (product,) = times_radius(absorption, radius, unit)
+    for name, given in (("--colour-thickness", colour_thickness), ("--render-colour", level)):
+        if given is not None and not colour:
+            raise UsageError(f"{name} is of a colour: give --deep-colour too")
+    if absorption is not None and not any(word in words for word in SIZES):
+        times_radius(absorption, None, unit)  # before anything is read
     table = format.read(file)
+    grains = in_words(table, words, unit, amount_needed=False)
+    radius = grains.radius if any(word in words for word in SIZES) else None
+    (product,) = times_radius(absorption, radius, unit)
     facts = describe(table, product, radius)
-    if packing is not None:
-        facts["medium"] = describe_medium(table, packing, radius, product)
+    facts |= describe_sizes(grains, radius)
+    if colour:
+        facts["colour"] = describe_colour(table, grains, radius, colour, colour_thickness, level)
+    if grains.packing_fraction is not None:
+        facts["medium"] = describe_medium(table, grains.packing_fraction, radius, product)
     if as_json:
         click.echo(json.dumps(facts, indent=1))
     else:
@@ -68,8 +96,8 @@ def main(
 def describe(table: "Table", absorption_times_radius: float = 0.0, radius: float | None = None) -> dict[str, Any]:
     """Return what `table` says, as ``tsdf-info --json`` writes it; None where a number is unknown.
 
-    With absorption (sigma_a R), `albedo` and `mean_cosine` are those of the absorbing grain. Their standard errors are
-    unknown.
+    With absorption (sigma_a R), `albedo`, `mean_cosine` and the asymmetry factors are those of the absorbing grain. The
+    standard errors of the first two are then unknown. With a radius, lengths of `OTHERS` are in its unit, else in R.
     """
     from tsdf.data.blocks import CONDITIONALS
     from tsdf.data.table import thawed
@@ -82,6 +110,17 @@ def describe(table: "Table", absorption_times_radius: float = 0.0, radius: float
         statistics["albedo"] = table.albedo(absorption_times_radius)
         statistics["mean_cosine"] = None if math.isnan(mean_cosine) else mean_cosine
         errors["albedo"] = errors["mean_cosine"] = None
+    scale = 1.0 if radius is None else radius
+    others = {
+        "absorption_enhancement": table.absorption_enhancement,
+        "single_scattering_albedo": table.single_scattering_albedo(absorption_times_radius),
+        "asymmetry_factor": table.asymmetry_factor(absorption_times_radius),
+        "asymmetry_factor_far_field": table.asymmetry_factor_far_field(absorption_times_radius),
+        "effective_radius": _times(table.effective_radius, scale),
+        "projected_area": _times(table.projected_area, scale**2),
+        "dark_share": table.dark_share,
+    }
+    errors |= {name: found.error for name, found in others.items()}
     return {
         "format_version": header["format_version"],
         "grain": grain["name"],
@@ -92,6 +131,7 @@ def describe(table: "Table", absorption_times_radius: float = 0.0, radius: float
         "absorption_times_radius": absorption_times_radius,
         "absorption": None if radius is None else absorption_times_radius / radius,
         **statistics,
+        **{name: None if math.isnan(found.value) else found.value for name, found in others.items()},
         "standard_errors": errors,
         "table_error": header["table_error"],
         "factorisation_error": header["factorisation_error"],
@@ -103,6 +143,66 @@ def describe(table: "Table", absorption_times_radius: float = 0.0, radius: float
         "pixels_sha256": header["pixels_sha256"],
         "licence": header["licence"],
     }
+
+
+def describe_sizes(grains: "InWords", radius: float | None) -> dict[str, Any]:
+    """Return sizes and amount of grains in the words of docs/sizes.md, as ``tsdf-info --json`` writes them.
+
+    Lengths are in the unit of `radius`, or in R where it is None; None where a number is unknown.
+    """
+    facts = grains.facts()
+    ssa = None if radius is None else facts["ssa"]
+    sizes = facts | {"radius": radius, "ssa": ssa}
+    return {
+        "specific_surface_area": ssa,
+        "solid_fraction": facts["solid_fraction"],
+        "density": facts["density"],
+        "sizes": sizes,
+    }
+
+
+def describe_colour(
+    table: "Table",
+    grains: "InWords",
+    radius: float | None,
+    colour: tuple[float, ...],
+    thickness: float | None = None,
+    level: str | None = None,
+) -> dict[str, Any]:
+    """Return the absorption that gives grains in bulk a colour, as ``tsdf-info --json`` writes it.
+
+    With a level, what the renderer makes of it there, and the absorption that is right there: that of a colour as far
+    off on the other side.
+    """
+    from tsdf.errors import UsageError
+    from tsdf.scene.deep import absorption_of_colour
+
+    packing = grains.packing_fraction
+    if packing is None and (thickness is not None or level is not None):
+        raise UsageError("a slab of some thickness, or a picture, is of packed grains: give --packing, say, too")
+    thick = math.inf if thickness is None else thickness / (radius or 1.0)
+
+    def absorbing(wanted: tuple[float, ...]) -> tuple[float, ...]:
+        return absorption_of_colour(table, wanted, thick, packing or 0.5)
+
+    def in_conventions(products: tuple[float, ...]) -> dict[str, Any]:
+        unit = grains.metres_per_unit
+        per_unit = None if radius is None else [x / radius for x in products]
+        per_metre = None if per_unit is None or unit is None else [a / unit for a in per_unit]
+        return {"absorption_times_radius": list(products), "absorption": per_unit, "absorption_per_metre": per_metre}
+
+    found = absorbing(colour)
+    facts = {"asked": list(colour), "thickness": thickness, **in_conventions(found)}
+    if level is not None:
+        from tsdf.picture.colour import rendered
+
+        assert packing is not None
+        seen, error = rendered(table, found * (3 // len(found)), packing, level, thick)
+        facts["rendered"] = {"level": level, "colour": seen.tolist(), "standard_errors": error.tolist()}
+        aim = tuple(2.0 * c - s for c, s in zip(colour, seen.tolist(), strict=False))
+        if all(0.0 < c < 1.0 for c in aim):
+            facts["rendered"] |= in_conventions(absorbing(aim))
+    return facts
 
 
 def describe_medium(
@@ -126,6 +226,46 @@ def describe_medium(
     return {"packing_fraction": packing, "radius": radius} | {
         name: value if math.isfinite(value) else None for name, value in numbers.items()
     }
+
+
+def _others(facts: Mapping[str, Any]) -> Iterator[str]:
+    """The quantities that others ask for, sizes, and the colour, for people."""
+    yield "in others' words (docs/glossary.md)"
+    sizes = facts["sizes"]
+    for name, (with_radius, without, word) in OTHERS.items():
+        value, error = facts[name], facts["standard_errors"][name]
+        spread = "" if value is None else " exact" if facts["method"] == "exact" else f" +- {error:.1g}"
+        unit = without if sizes["radius"] is None else with_radius
+        text = "unknown" if value is None else f"{value:.6g}{spread} {unit}".rstrip()
+        yield f"  {name:<26} {text}" + (f"  ({word})" if word else "")
+    length = "R" if sizes["radius"] is None else "units"
+    for name, value in sizes.items():
+        if value is not None and name != "effective_radius":
+            yield f"  {name:<26} {value:.6g} {SIZE_UNITS.get(name, length)}".rstrip()
+    if "colour" in facts:
+        colour = facts["colour"]
+        body = "a deep medium" if colour["thickness"] is None else f"a slab {colour['thickness']:g} {length} thick"
+        yield f"colour of {body} in diffuse light: {', '.join(f'{c:g}' for c in colour['asked'])}"
+        yield f"  {'absorption':<26} {_conventions(colour)}"
+        if "rendered" in colour:
+            seen = colour["rendered"]
+            by = ", ".join(f"{c:.4f} +- {e:.1g}" for c, e in zip(seen["colour"], seen["standard_errors"], strict=True))
+            yield f"  {'rendered, ' + seen['level']:<26} {by}"
+            if "absorption_times_radius" in seen:
+                yield f"  {'absorption right there':<26} {_conventions(seen)}"
+
+
+def _conventions(facts: Mapping[str, Any]) -> str:
+    """An absorption in all conventions that are known."""
+    known = {"R": "absorption_times_radius", "unit": "absorption", "m": "absorption_per_metre"}
+    return " = ".join(
+        f"{', '.join(f'{x:.4g}' for x in facts[key])} / {name}" for name, key in known.items() if facts[key] is not None
+    )
+
+
+def _times(found: "Measured", scale: float) -> "Measured":
+    """Return a number and its error in another unit."""
+    return found._replace(value=found.value * scale, error=found.error * scale)
 
 
 def _lines(facts: Mapping[str, Any]) -> Iterator[str]:
@@ -161,13 +301,14 @@ def _lines(facts: Mapping[str, Any]) -> Iterator[str]:
         both = f"{product:g} / R" + ("" if facts["absorption"] is None else f", {facts['absorption']:g} / unit")
         yield row("absorption", f"{both}, in albedo and mean_cosine; all else is lossless")
     for name, error in facts["standard_errors"].items():
-        if name == "legendre_moments" or name not in facts:
+        if name == "legendre_moments" or name not in facts or name in OTHERS:
             continue
         text = known(facts[name], ".6f")
         text += "" if error is None else " exact" if facts["method"] == "exact" else f" +- {error:.1g}"
         yield row(name, f"{text} {UNITS.get(name, '')}".rstrip())
     moments = " ".join(f"{value:.4f}" for value in facts["legendre_moments"])
     yield row("legendre_moments", moments)
+    yield from _others(facts)
     if "medium" in facts:
         medium = facts["medium"]
         length = "R" if medium["radius"] is None else "units"

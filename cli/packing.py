@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsdf.cli.common import Tool, check_output, plain, say, shown_progress, whole_number
+from tsdf.cli.common import Tool, check_output, plain, say, seed_option, shown_progress, whole_number
 from tsdf.errors import UsageError
 
 if TYPE_CHECKING:
-    from tsdf.spheres.neighbours import PackingTable
+    from tsdf.spheres.packing_table import PackingTable
 
 
 @click.command("tsdf-packing", cls=Tool)
@@ -51,9 +51,7 @@ if TYPE_CHECKING:
 @click.option(
     "--records", callback=whole_number, default="256", metavar="K", show_default=True, help="Records of each cell."
 )
-@click.option(
-    "--seed", callback=whole_number, default="0", metavar="N", show_default=True, help="Seed of the random numbers."
-)
+@seed_option("0")
 @click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
 def main(
     file: Path | None,
@@ -77,14 +75,14 @@ def main(
     if file is not None and not info:
         raise UsageError("FILE goes with --info; the table to make is named by --out")
 
-    from tsdf.spheres import neighbours
+    from tsdf.spheres import packing_table
 
     if out is None:
-        for line in _lines(neighbours.shipped() if file is None else neighbours.read(file)):
+        for line in _lines(packing_table.shipped() if file is None else packing_table.read(file)):
             click.echo(plain(line))
         return
     check_output(out)
-    chosen = fractions or neighbours.FRACTIONS
+    chosen = fractions or packing_table.FRACTIONS
     done = 0
     with shown_progress(quiet) as progress:
 
@@ -93,8 +91,8 @@ def main(
             done += 1
             progress(done / len(set(chosen)), f"packing fraction {fraction:g}")
 
-        table = neighbours.tabulate(chosen, packings, spheres, lines, cells, records, seed, progress=told)
-    neighbours.write(table, out)
+        table = packing_table.tabulate(chosen, packings, spheres, lines, cells, records, seed, progress=told)
+    packing_table.write(table, out)
     if not quiet:
         for line in _lines(table, str(out)):
             say(plain(line))

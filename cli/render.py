@@ -1,12 +1,15 @@
 """``tsdf-render``: a scene in, a picture out."""
 
 import json
+import math
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from tsdf.cli.common import LEVELS, Tool, check_numbers, check_output, plain, say, working
+from tsdf.cli.common import LEVELS, Tool, check_numbers, check_output, plain, say, seed_option, threads_option, working
 from tsdf.cli.start import interrupt_status
 
 if TYPE_CHECKING:
@@ -21,19 +24,29 @@ if TYPE_CHECKING:
     help="Picture to write, NAME.exr (linear RGB and the variance of each pixel); NAME.png is written beside it.",
 )  # fmt: skip
 @click.option("--level", type=click.Choice(LEVELS), help="How grains are modelled.  [default: the scene's]")
+@click.option(
+    "--explicit-grains", type=int, metavar="K",
+    help="Follow the first K grains from the camera one by one, then as the level does.  [default: the scene's]",
+)  # fmt: skip
 @click.option("--spp", type=int, metavar="N", help="Samples per pixel.  [default: the scene's]")
 @click.option("--seconds", type=float, metavar="S", help="Stop after S seconds instead.")
 @click.option(
     "--target-error", type=float, metavar="E",
     help="Stop when the standard error of pixels, over the mean of the picture, is below E instead.",
 )  # fmt: skip
-@click.option("--seed", type=int, metavar="N", help="Of the random numbers, >= 0.  [default: the scene's]")
+@seed_option("the scene's")
 @click.option("--width", type=int, metavar="PIXELS", help="Width of the picture; its shape is kept.")
-@click.option("--threads", type=int, metavar="N", help="[default: all processors]")
+@click.option(
+    "--leap", type=float, metavar="G",
+    help="Take many events in one step where nothing is nearer than G transport mean free paths; 0 never does.  "
+    "[default: the scene's, else 2]",
+)  # fmt: skip
+@threads_option
 @click.option("--quiet", is_flag=True, help="No progress bar, no summary.")
 def main(
-    scene: Path, out: Path, level: str | None, spp: int | None, seconds: float | None, target_error: float | None,
-    seed: int | None, width: int | None, threads: int | None, quiet: bool,
+    scene: Path, out: Path, level: str | None, explicit_grains: int | None, spp: int | None, seconds: float | None,
+    target_error: float | None, seed: int | None, width: int | None, leap: float | None, threads: int | None,
+    quiet: bool,
 ) -> int:  # fmt: skip
     """Render the picture of SCENE, a TOML file.
 
@@ -46,16 +59,23 @@ def main(
     if out.suffix.lower() != ".exr":
         raise UsageError(f"--out {plain(out)}: is to end in .exr")
     check_numbers(seed, spp=spp, width=width, threads=threads)
+    if explicit_grains is not None and explicit_grains < 0:
+        raise UsageError(f"--explicit-grains is a whole number, 0 for none, not {explicit_grains}")
     for name, limit in (("--seconds", seconds), ("--target-error", target_error)):
         if limit is not None and not 0.0 < limit < float("inf"):
             raise UsageError(f"{name} is a finite number above 0, not {limit:g}")
     if sum(stop is not None for stop in (spp, seconds, target_error)) > 1:
         raise UsageError("--spp, --seconds and --target-error each say when to stop: give one")
 
-    from tsdf.picture import image, render, world
-    from tsdf.scene.scene import files_of, load, resized
+    from tsdf.picture import image, leaping, render, world
+    from tsdf.scene.scene import MAX_EXPLICIT, files_of, load, resized
 
+    if leap is not None:
+        leaping.checked(leap, "--leap")
     read = resized(load(scene), width)
+    if explicit_grains is not None:
+        most = min(explicit_grains, MAX_EXPLICIT)  # no path meets so many
+        read = replace(read, render=replace(read.render, explicit_grains=most))
     check_output(out, scene, *files_of(read), beside=[out.with_suffix(".png")])
     if spp is None and seconds is None and target_error is None:
         spp = read.render.spp
@@ -68,7 +88,7 @@ def main(
             work.told(share, word)
 
         work.told(0.0, "reading the scene")
-        made = world.build(read, level or read.render.level)
+        made = world.build(read, level or read.render.level, leap=leap, progress=work.told)
         for note in made.notes:
             work.progress.note(note)
         image.prepare()
@@ -78,6 +98,8 @@ def main(
             click.echo("interrupted before the first sample: nothing is written", err=True)
             return interrupt_status()
         save(made, picture, seed, out)
+    if picture.trust is not None and picture.trust.doubt is not None:
+        click.echo(f"warning: {picture.trust.doubt}", err=True)
     if not quiet or picture.interrupted:
         summary(made, picture, out)
     return interrupt_status() if picture.interrupted else 0
@@ -85,7 +107,7 @@ def main(
 
 def save(world: "World", picture: "Picture", seed: int, out: Path) -> None:
     """Write the EXR, with what it was made by as the attribute ``tsdf_render``, and the PNG beside it."""
-    from tsdf.make import estimate
+    from tsdf import files
     from tsdf.picture import image
 
     facts = {
@@ -94,10 +116,23 @@ def save(world: "World", picture: "Picture", seed: int, out: Path) -> None:
         "samples": [int(picture.samples.min()), int(picture.samples.max())],
         "seed": seed,
         "events": picture.events,
+        "leap": world.leap,
+        "leapt": picture.leapt,
+        "leaps": picture.leaps,
         "truncated": picture.truncated,
         "faults": picture.faults,
-        "software": estimate.software(),
+        "software": files.software(),
     }
+    if singles := world.scene.render.explicit_grains:
+        facts["explicit_grains"] = singles
+    if picture.trust is not None:
+        facts |= {
+            "trusted": picture.trust.doubt is None,
+            "vov": picture.trust.vov,
+            "slope": picture.trust.slope if math.isfinite(picture.trust.slope) else None,
+            "met_by_chance": 1.0 / picture.trust.chance if picture.trust.chance > 0.0 else None,
+            "unsure_pixels": picture.trust.unsure,
+        }
     image.write_exr(out, picture.rgb, picture.variance, {"tsdf_render": json.dumps(facts)})
     image.write_png(out.with_suffix(".png"), picture.rgb, world.scene.camera.exposure)
 
@@ -106,12 +141,32 @@ def summary(world: "World", picture: "Picture", out: Path) -> None:
     """Say on standard output what the picture holds."""
     low, high = int(picture.samples.min()), int(picture.samples.max())
     held = f"{low}" if low == high else f"{low} to {high}"
+    singles = world.scene.render.explicit_grains
+    after = f" after {singles} explicit grains" if singles else ""
     state = "interrupted: holds" if picture.interrupted else "holds"
     say(
-        f"{plain(out)}: {state} {held} samples per pixel, level {world.level}, relative error "
+        f"{plain(out)}: {state} {held} samples per pixel, level {world.level}{after}, relative error "
         f"{picture.relative_error:.2g}, {picture.seconds:.1f} s, {picture.events / max(picture.seconds, 1e-9):.3g} "
         "grain events per second"
     )
+    for line in media(world):
+        say(line)
     lost = picture.truncated + picture.faults
     if lost:
         click.echo(f"warning: {lost} paths were given up ({picture.faults} of them at a fault of a mesh)", err=True)
+
+
+def media(world: "World") -> Iterator[str]:
+    """What the media of a scene hold, in our words and in others', one line each, and the colours asked for."""
+    from tsdf.cli.absorption import conventions
+    from tsdf.scene.scene import called
+
+    for number, (medium, packed) in enumerate(zip(world.scene.media, world.sizes, strict=True), 1):
+        title = called("medium", number, medium.name)
+        yield f"{title}: {packed.summary()}"
+        for grain in medium.grains:
+            if colour := grain.absorption.colour:
+                by_radius = [a * medium.radius for a in grain.absorption.coefficient]
+                same = conventions(by_radius, medium.radius, world.scene.metres_per_unit)
+                deep = "deep" if math.isinf(grain.absorption.thickness) else f"{grain.absorption.thickness:g} thick"
+                yield f"{title}: colour {', '.join(f'{c:g}' for c in colour)} where {deep}: absorption {same}"

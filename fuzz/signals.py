@@ -24,33 +24,18 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 TABLE = ROOT / "reference_data" / "golden" / "checks" / "cube.tsdf.exr"
 ANSWER_S = 2.0
-SCENE = """
-[camera]
-position = [0.0, -9.0, 3.0]
-target = [0.0, 0.0, 0.0]
-width = 32
-height = 24
-[[light]]
-type = "constant"
-radiance = [1.0, 1.0, 1.0]
-[[medium]]
-packing_fraction = 0.4
-radius = 0.1
-shape = { type = "sphere", centre = [0.0, 0.0, 0.0], radius = 2.0 }
-[[medium.grain]]
-table = "table.exr"
-"""
+SCENE = ROOT / "tests" / "ball.toml"
 COMMANDS = {
-    "accuracy": "table.exr --out folder --packing 0.1 --seconds 1000",
+    "accuracy": "cube.tsdf.exr --out folder --packing 0.1 --seconds 1000",
     "build": "cube --eta 1.31 --paths 1e9 --out new.exr",
     "compare": "scene.toml --out folder --spp 1000",
-    "export": "table.exr --to csv --packing 0.3 --radius 1 --out new.csv",
-    "info": "table.exr",
+    "export": "cube.tsdf.exr --to csv --packing 0.3 --radius 1 --out new.csv",
+    "info": "cube.tsdf.exr",
     "merge": "part --out new.exr",
     "packing": "--out new.exr --spheres 20000",
-    "plot": "table.exr --out new.png",
+    "plot": "cube.tsdf.exr --out new.png",
     "render": "scene.toml --out new.exr --spp 1000000",
-    "validate": "table.exr table.exr table.exr",
+    "validate": "cube.tsdf.exr cube.tsdf.exr cube.tsdf.exr",
 }
 
 
@@ -85,8 +70,8 @@ def trial(command: str, at: float, number: int, cold: bool, kept: Path) -> Trial
     """Start a command in a folder of its own, send it a signal, and see what it does."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        shutil.copy(TABLE, folder / "table.exr")
-        (folder / "scene.toml").write_text(SCENE)
+        shutil.copy(TABLE, folder / "cube.tsdf.exr")
+        shutil.copy(SCENE, folder / "scene.toml")
         if command == "merge":
             shutil.copy(kept / "part", folder)
         own = folder / "cache" if cold else kept / "cache"

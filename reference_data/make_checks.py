@@ -27,7 +27,7 @@ def bases() -> None:
     """Build the sound tables with this library."""
     from tsdf.grain.grains import load_grain
     from tsdf.grain.optics import Optics
-    from tsdf.make import estimate
+    from tsdf.make import assemble
     from tsdf.make.exact import exact_table
     from tsdf.make.tally import Tally
     from tsdf.make.tracer import Tracer
@@ -53,7 +53,7 @@ def bases() -> None:
         tally = Tally(joint, memory)
         Tracer(grain, eta, seed=1).trace(np.arange(paths), tally)
         traced = {**made, "method": "traced", "seed": 1, "paths": paths, "max_bounces": 100_000}
-        tables[name] = estimate.traced_table(tally, cells, shape, Optics(eta), traced, memory)
+        tables[name] = assemble.traced_table(tally, cells, shape, Optics(eta), traced, memory)
     CHECKS.mkdir(parents=True, exist_ok=True)
     for name, table in tables.items():
         format.write(table, CHECKS / f"{name}.tsdf.exr")

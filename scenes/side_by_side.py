@@ -49,7 +49,9 @@ def difference(one: image.Image, truth: image.Image) -> Difference:
 
 def level_of(picture: image.Image) -> str:
     """Return the level that a picture of `tsdf-render` was made at."""
-    return str(json.loads(picture.attributes.get("tsdf_render", "{}")).get("level", "another"))
+    facts = json.loads(picture.attributes.get("tsdf_render", "{}"))
+    after = f", {facts['explicit_grains']} explicit" if "explicit_grains" in facts else ""
+    return str(facts.get("level", "another")) + after
 
 
 def side_by_side(pictures: Sequence[Path], out: Path) -> list[tuple[str, Difference]]:

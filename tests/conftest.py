@@ -1,8 +1,9 @@
 """Tests keep their packings to themselves: no test reads or writes the user's cache. The scripts of fuzz/ by name."""
 
 import importlib.util
+import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -15,6 +16,21 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     patch = pytest.MonkeyPatch()
     patch.setenv("TSDF_CACHE", str(folder))
     return folder
+
+
+@pytest.fixture
+def launch() -> Iterator[Callable[..., subprocess.Popen]]:
+    """Start processes, as `subprocess.Popen` does, which end with the test, whatever becomes of it."""
+    begun: list[subprocess.Popen] = []
+
+    def start(words: list[str], **options: object) -> subprocess.Popen:
+        begun.append(subprocess.Popen(words, **options))  # type: ignore[call-overload]
+        return begun[-1]
+
+    yield start
+    for process in begun:
+        with process:
+            process.kill()
 
 
 @pytest.fixture(scope="session")

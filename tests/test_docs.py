@@ -1,9 +1,10 @@
-"""The documents say what is so: their code runs, their commands parse, the names in them exist.
+"""The documents say what is so: their code runs, their commands parse, the names in them exist; so do docstrings.
 
 Each fenced block is judged by its language, each command by the parser of the command itself, and each option in the
 text by whether a command has it. `docs/cpp.md` is compiled in tests/loaders/test_cpp.py as well; here its names are.
 """
 
+import doctest
 import json
 import re
 import shlex
@@ -22,6 +23,7 @@ import click
 import numpy as np
 import pytest
 
+import tsdf
 from tsdf.data import container
 from tsdf.reference_data import make_golden
 from tsdf.reference_data.make_checks import CHECKS
@@ -36,6 +38,20 @@ COMMANDS: dict[str, click.Command] = {
     name: import_module(f"tsdf.cli.{name.removeprefix('tsdf-')}").main for name in SCRIPTS
 }
 FOREIGN = {"--no-index", "--editable"}  # options of other people's commands
+EXAMPLES = sorted(
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    for path in ROOT.glob("tsdf/**/*.py")
+    if ">>> " in path.read_text()
+)
+HEAP = """
+camera = { position = [0, -8, 1], target = [0, 0, 1], width = 160, height = 120 }
+light = [{ type = "constant", radiance = 1.0 }]
+[[medium]]
+shape = { type = "mesh", file = "heap.obj" }
+packing_fraction = 0.5
+radius = 0.05
+grain = [{ table = "snow.tsdf.exr" }]
+"""
 
 
 def blocks(path: Path) -> list[tuple[str, str]]:
@@ -67,10 +83,11 @@ def options_of(command: click.Command) -> set[str]:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with the files that the documents name: tables, meshes and a sky."""
+    """A folder with the files that documents and docstrings name: tables, meshes, a sky and a scene."""
     import OpenEXR
 
-    for name in ("snow", "sphere", "quartz"):
+    (tmp_path / "heap.toml").write_text(HEAP)
+    for name in ("snow", "sphere", "quartz", "cube"):
         shutil.copy(CHECKS / "cube_memory.tsdf.exr", tmp_path / f"{name}.tsdf.exr")
     faces = [(1, 3, 2), (1, 2, 4), (2, 3, 4), (1, 4, 3)]
     corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
@@ -102,7 +119,7 @@ def test_blocks_are_of_known_languages(path: Path) -> None:
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_commands_parse(path: Path) -> None:
     """Each command of ours is taken by its own parser, without being run; others name targets and files there are."""
-    targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), flags=re.M)
+    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), flags=re.M)
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     for line in commands(path):
         program, *arguments = shlex.split(line, comments=True)
@@ -144,6 +161,52 @@ def test_names_in_the_text_exist(path: Path) -> None:
             assert (ROOT / words[1]).exists() or (path.parent / words[1]).exists(), span
 
 
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_lead_somewhere(path: Path) -> None:
+    """Pages and pictures that a document points to, and the headings in them."""
+    for target in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"^```.*?^```$", "", path.read_text(), flags=re.M | re.S)):
+        if "://" in target:
+            continue
+        file, _, heading = target.partition("#")
+        there = path.parent / file if file else path
+        assert there.exists(), target
+        headings = re.findall(r"^#+ (.*)$", there.read_text(), flags=re.M) if heading else []
+        assert not heading or heading in {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}, (
+            target
+        )
+
+
+def test_the_recipes_name_what_is_there() -> None:
+    """Files and folders of CONTRIBUTING, and the names in capitals that it says stand in them."""
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    paths = {span for span in spans(ROOT / "CONTRIBUTING.md") if re.fullmatch(r"[\w./]+/[\w./]*", span)}
+    assert len(paths) > 20
+    for path in paths - {"reference/"}:
+        assert (ROOT / path).exists(), path
+    files = [ROOT / path for path in paths if path.endswith(".py")]
+    code = "".join(path.read_text() for path in files)
+    for name in re.findall(r"`(_?[A-Z]+|test_\w+)`", text):
+        assert re.search(rf"\b{name}\b", code), name
+
+
+def test_the_index_lists_all_pages() -> None:
+    index = (ROOT / "docs" / "index.md").read_text()
+    for path in [*ROOT.glob("docs/*.md"), *ROOT.glob("schema/*.md"), ROOT / "CONTRIBUTING.md", ROOT / "CITATION.cff"]:
+        assert path.name == "index.md" or f"{path.name})" in index, path.name
+
+
+@pytest.mark.slow
+def test_the_reference_shows_what_is_public(tmp_path: Path) -> None:
+    """Names that are imported when asked for, and each room; nothing that pdoc warns of."""
+    done = subprocess.run([sys.executable, ROOT / "docs" / "reference.py", tmp_path], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    page = (tmp_path / "tsdf.html").read_text()
+    for name in set(tsdf.__all__) - {"__version__"}:
+        assert f'<section id="{name}">' in page, name
+    rooms = {path.stem for path in ROOT.glob("tsdf/[a-z]*") if path.suffix in {"", ".py"}}
+    assert rooms <= {path.stem for path in (tmp_path / "tsdf").glob("*.html")}
+
+
 @pytest.mark.parametrize(
     "path", [path for path in DOCUMENTS if any(kind == "toml" for kind, _ in blocks(path))], ids=lambda path: path.name
 )
@@ -153,6 +216,7 @@ def test_scenes_load(path: Path, folder: Path) -> None:
         assert scene.load(folder / f"{i}.toml").media
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "path",
     [path for path in DOCUMENTS if any(kind == "python" for kind, _ in blocks(path))],
@@ -177,6 +241,27 @@ def test_python_runs(path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) 
     assert any(not isinstance(value, ModuleType) for name, value in held.items() if name[:2] != "__")
 
 
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_examples_run(name: str, folder: Path) -> None:
+    """Each example of a module's docstrings, in a folder with the files that it names."""
+    module = import_module(name)
+    done = doctest.testmod(module, optionflags=doctest.NORMALIZE_WHITESPACE)
+    assert done.failed == 0 and done.attempted > 0
+
+
+def test_what_is_public_has_an_example() -> None:
+    """All that `tsdf` promises is there, is listed, typed and has an example, but for errors; nothing else is."""
+    assert dir(tsdf) == sorted(tsdf.__all__) and "numpy" not in dir(tsdf)
+    typed = re.findall(r"^    from tsdf\.\S+ import \w+ as (\w+)$", Path(tsdf.__file__).read_text(), flags=re.M)
+    assert {*typed, "__version__"} == set(tsdf.__all__)
+    for name in typed:
+        what = getattr(tsdf, name)
+        assert ">>> " in (what.__doc__ or "") or issubclass(what, Exception), name
+    with pytest.raises(AttributeError, match="no attribute 'reed'"):
+        tsdf.reed  # noqa: B018
+
+
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++, the C++ compiler, in PATH")
 def test_names_of_the_cpp_page_exist(tmp_path: Path) -> None:
     """Each expression of the tables in docs/cpp.md compiles; a name that does not exist is found out: the control."""

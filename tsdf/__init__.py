@@ -1,4 +1,15 @@
-"""TSDFs: teleportation scattering distribution functions of grains (Meng et al. 2015)."""
+"""TSDFs: teleportation scattering distribution functions of grains (Meng et al. 2015).
+
+What is named here is what the toolkit promises to keep: tables are read, written, built and sampled, scenes and grains
+loaded, pictures rendered. Everything else is reached through its room (``tsdf.judge.analytic``, say) and may move.
+
+Examples
+--------
+>>> import tsdf
+>>> table = tsdf.read("snow.tsdf.exr")
+>>> table.albedo(0.1) < table.albedo() == 1  # absorption sigma_a times R; without it a grain is lossless
+True
+"""
 
 from typing import TYPE_CHECKING, Any
 
@@ -9,16 +20,44 @@ if TYPE_CHECKING:
     from tsdf.data.table import Table as Table
     from tsdf.errors import FormatError as FormatError
     from tsdf.errors import TSDFError as TSDFError
+    from tsdf.grain.grains import load_grain as load_grain
+    from tsdf.grain.optics import Optics as Optics
+    from tsdf.make.build import build as build
+    from tsdf.make.scatterometer import Effort as Effort
+    from tsdf.picture.shot import render as render
+    from tsdf.scene.scene import load as load_scene
+
+    __version__: str
 
 _HOMES = {
-    "read": "data.format",
-    "write": "data.format",
-    "Table": "data.table",
-    "Sampler": "data.sampler",
-    "FormatError": "errors",
-    "TSDFError": "errors",
+    "Effort": "make.scatterometer:Effort",
+    "FormatError": "errors:FormatError",
+    "Optics": "grain.optics:Optics",
+    "Sampler": "data.sampler:Sampler",
+    "TSDFError": "errors:TSDFError",
+    "Table": "data.table:Table",
+    "build": "make.build:build",
+    "load_grain": "grain.grains:load_grain",
+    "load_scene": "scene.scene:load",
+    "read": "data.format:read",
+    "render": "picture.shot:render",
+    "write": "data.format:write",
 }
-__all__ = ["FormatError", "Sampler", "TSDFError", "Table", "__version__", "read", "write"]
+__all__ = [
+    "Effort",
+    "FormatError",
+    "Optics",
+    "Sampler",
+    "TSDFError",
+    "Table",
+    "__version__",
+    "build",
+    "load_grain",
+    "load_scene",
+    "read",
+    "render",
+    "write",
+]
 
 
 def __getattr__(name: str) -> Any:
@@ -31,7 +70,8 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'tsdf' has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(f"tsdf.{_HOMES[name]}"), name)
+    home, _, known = _HOMES[name].partition(":")
+    return getattr(import_module(f"tsdf.{home}"), known)
 
 
 def __dir__() -> list[str]:

@@ -19,7 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core import caching, cpu, event, types
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba.core import caching, cgutils, cpu, event, types
+from numba.extending import intrinsic
 
 from tsdf.files import whole
 
@@ -43,6 +45,21 @@ def njit(**options: Any) -> Callable[[Any], Any]:
         return kernel
 
     return compiled
+
+
+@intrinsic
+def fetch(typing: Any, row: Any) -> Any:
+    """Have the processor bring the begin of an array into its cache: for kernels, what is soon read at random."""
+
+    def written(context: Any, builder: Any, kind: Any, args: Any) -> Any:
+        data = cgutils.create_struct_proxy(kind.args[0])(context, builder, args[0]).data
+        byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+        hint = ir.FunctionType(ir.VoidType(), (byte, number, number, number))
+        hint = cgutils.get_or_insert_function(builder.module, hint, "llvm.prefetch.p0i8")
+        builder.call(hint, (builder.bitcast(data, byte), number(0), number(3), number(1)))
+        return context.get_dummy_value()
+
+    return types.none(row), written
 
 
 def _any(kind: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Writing a file whole or not at all, and finding out beforehand whether it can be, and whether memory will do.
+"""Files: written whole or not at all; whether they can be, and whether memory will do, found out beforehand.
 
 A file is written under a hidden name beside its own, `.NAME.HEX.tmp`, then moved. Its writer holds a lock on it, which
 ends with the process, so that the next one to write NAME can tell what a killed process left and take it away.
@@ -14,6 +14,7 @@ import stat
 import threading
 import time
 from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -182,3 +183,11 @@ def need_memory(size: int) -> None:
         mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=0).close()
     except OSError:
         raise MemoryError from None
+
+
+def software() -> str:
+    """Return name and version of this package, as files say what made them."""
+    try:
+        return f"tsdf-toolkit {version('tsdf-toolkit')}"
+    except PackageNotFoundError:
+        return "tsdf-toolkit"

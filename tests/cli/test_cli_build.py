@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +46,7 @@ def test_sphere(tmp_path: Path) -> None:
     assert table.header["provenance"]["command"] == "tsdf-build sphere --eta 1.33 --fresnel un"
 
 
+@pytest.mark.slow
 def test_the_recorded_command_makes_the_same_bytes(tmp_path: Path) -> None:
     first, second = tmp_path / "1.exr", tmp_path / "2.exr"
     words = [
@@ -90,8 +92,8 @@ def test_progress_and_summary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def test_progress_says_the_error_and_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it stands, the goal, and once, if it will take long, how long."""
-    from tsdf.make.estimate import TableError
     from tsdf.make.scatterometer import Progress
+    from tsdf.make.statistics import TableError
 
     class Recorder(common.Progress):
         def __call__(self, share: float, word: str) -> None:
@@ -114,6 +116,7 @@ def test_progress_says_the_error_and_what_is_left(monkeypatch: pytest.MonkeyPatc
     assert note.startswith("--target-error 0.01 takes about 1.0e+06 paths, 166 minutes more")
 
 
+@pytest.mark.slow
 def test_max_seconds_and_then_more(tmp_path: Path) -> None:
     """The table as good as it got, the paths kept, and from them any other table."""
     out = tmp_path / "x.exr"
@@ -170,14 +173,14 @@ def test_parts_and_merge(tmp_path: Path) -> None:
     assert not (tmp_path / "x.exr").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_interrupt_says_what_is_safe(number: int, tmp_path: Path) -> None:
+def test_interrupt_says_what_is_safe(number: int, tmp_path: Path, launch: Callable[..., subprocess.Popen]) -> None:
     out = tmp_path / "i.tsdf.exr"
     command = [sys.executable, "-c", "from tsdf.cli.build import main; main()"]
     command += ["cube", "--eta", "1.31", "--paths", "1e9", "--threads", "1", "--quiet", "--out", str(out)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 60
-    while not Path(f"{out}.part").exists() and time.monotonic() < deadline:
+    process = launch(command, stderr=subprocess.PIPE, text=True)
+    while not Path(f"{out}.part").exists() and process.poll() is None:
         time.sleep(0.01)
     time.sleep(1.0)  # counts that are in no file yet
     process.send_signal(number)

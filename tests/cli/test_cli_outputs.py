@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from tsdf.cli.export import TARGETS
 from tsdf.picture import image
 from tsdf.reference_data.make_checks import CHECKS
 
@@ -136,7 +137,7 @@ FILES: dict[str, tuple[Callable[[Path], tuple[object, ...]], str]] = {
     "validate": (lambda at: ("validate", at / "table.png", "--plot"), "table.png"),
     **{
         f"export, {to}": (lambda at, to=to: ("export", at / "table.csv", *MEDIUM, "--to", to), "table.csv")  # type: ignore[misc]
-        for to in ("pbrt", "blender", "openpbr", "materialx", "arnold", "karma", "csv", "npz")
+        for to in TARGETS
     },
     "render, scene": (lambda at: ("render", scene(at, "scene.exr")), "scene.exr"),
     **{

@@ -1,6 +1,7 @@
 """tsdf-info, tsdf-plot, tsdf-validate: results on standard output, one-line errors, exit statuses, no tracebacks."""
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from tsdf.cli.common import Tool, plain
 from tsdf.data import format
 from tsdf.errors import FormatWarning, TSDFError, UsageError
 from tsdf.reference_data.make_checks import CHECKS
+from tsdf.scene.deep import deep_colour
 
 SPHERE, CUBE = str(CHECKS / "sphere.tsdf.exr"), str(CHECKS / "cube.tsdf.exr")
 WRONG = str(CHECKS / "PHYSICS_CHORD.tsdf.exr")
@@ -61,6 +63,43 @@ def test_info_for_people():
     for text in (f"{table.statistics['mean_z']:.6f} +- ", "Henyey-Greenstein", "scattered", "eta", "131072 paths"):
         assert text in result.stdout
     assert "exact" in run(info, SPHERE).stdout
+
+
+def test_info_in_others_words():
+    """What snow scientists ask for, in JSON, by any word of size and amount; in metres here, of ice."""
+    options = ("--effective-radius", "1e-4", "--density", "200", "--material-density", "917", "--unit", "1")
+    facts = json.loads(run(info, SPHERE, "--json", *options).stdout)
+    assert facts["absorption_enhancement"] == pytest.approx(1.333**2 * (1.0 - (1.0 - 1.333**-2) ** 1.5), abs=1e-9)
+    assert facts["asymmetry_factor"] == facts["mean_cosine"]
+    assert facts["asymmetry_factor_far_field"] == pytest.approx((1.0 + facts["mean_cosine"]) / 2.0)
+    assert facts["specific_surface_area"] == pytest.approx(3.0 / 917.0 / 1e-4)
+    assert facts["effective_radius"] == pytest.approx(1e-4) and facts["projected_area"] == pytest.approx(math.pi * 1e-8)
+    assert facts["solid_fraction"] == pytest.approx(200.0 / 917.0)
+    assert facts["dark_share"] == pytest.approx((1.0 - 1.333**-2) ** 1.5, abs=1e-9)
+    assert facts["medium"]["packing_fraction"] == facts["sizes"]["packing_fraction"] == facts["solid_fraction"]
+    for name in ("absorption_enhancement", "asymmetry_factor", "asymmetry_factor_far_field", "effective_radius"):
+        assert facts["standard_errors"][name] == 0.0
+    assert json.loads(run(info, CUBE, "--json").stdout)["standard_errors"]["absorption_enhancement"] > 0.0
+    said = run(info, SPHERE, *options).stdout
+    assert "ssa                        32.7154 m2/kg" in said and "density                    200 kg/m3" in said
+    assert json.loads(run(info, SPHERE, "--json").stdout)["specific_surface_area"] is None
+
+
+def test_info_of_a_colour():
+    """Absorption in all conventions; lengths are those said, here R of 2 mm."""
+    options = ("--deep-colour", "0.9,0.5,0.2", "--radius", "2", "--unit", "1e-3")
+    colour = json.loads(run(info, SPHERE, "--json", *options).stdout)["colour"]
+    by_radius = colour["absorption_times_radius"]
+    assert [deep_colour(format.read(SPHERE), x) for x in by_radius] == pytest.approx([0.9, 0.5, 0.2], abs=1e-6)
+    assert colour["absorption"] == pytest.approx([x / 2.0 for x in by_radius])
+    assert colour["absorption_per_metre"] == pytest.approx([x / 2e-3 for x in by_radius])
+    units = {"R": 1.0, "unit": 2.0, "m": 2e-3}
+    said = " = ".join(f"{', '.join(f'{x / by:.4g}' for x in by_radius)} / {unit}" for unit, by in units.items())
+    assert said in run(info, SPHERE, *options).stdout
+    thin = ("--colour-thickness", "20", "--packing", "0.6")
+    slab = json.loads(run(info, SPHERE, "--json", "--albedo", "0.3", "--radius", "2", *thin).stdout)["colour"]
+    (whole,) = json.loads(run(info, SPHERE, "--json", "--albedo", "0.3").stdout)["colour"]["absorption_times_radius"]
+    assert 0.0 < slab["absorption_times_radius"][0] < whole
 
 
 def test_absorption_changes_albedo_and_mean_cosine_only():
@@ -162,7 +201,20 @@ def test_medium_without_deflection():
         (("--packing", "0.8"), ("--packing", "0.74")),
         (("--packing", "nan"), ("--packing", "0.74")),
         (("--packing", "0.5", "--radius", "0"), ("--radius", "> 0")),
-        (("--radius", "1"), ("--radius", "--packing")),
+        (("--density", "900"), ("--density", "names none that is known", "say material_density")),
+        (
+            ("--density", "900", "--material-density", "900"),
+            ("--density", "would take a packing fraction of 1:", "0.64"),
+        ),
+        (("--ssa", "20"), ("--ssa", "--unit")),
+        (("--radius", "1", "--sieve", "2"), ("--radius, --sieve", "give one")),
+        (("--colour-thickness", "1"), ("--colour-thickness", "--deep-colour")),
+        (("--deep-colour", "1,.5,.5"), ("--deep-colour 1,.5,.5", "not 1: without any absorption it is 1")),
+        (("--deep-colour", "0"), ("--deep-colour", "not 0: grains reflect some light")),
+        (("--deep-colour", "red"), ("--deep-colour", "one number or three, R,G,B, not 'red'")),
+        (("--deep-colour", ".5", "--absorption", "1/R"), ("--absorption and --deep-colour",)),
+        (("--deep-colour", ".9", "--colour-thickness", "1"), ("give --packing",)),
+        (("--albedo", "0.001"), ("a colour of 0.001 is out of reach", "say more than that")),
         (("--packing", "x"), ("--packing",)),
     ],
 )

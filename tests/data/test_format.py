@@ -359,6 +359,7 @@ def test_every_truncation_is_refused() -> None:
         assert all(codes(data[:length]) for length in range(len(data)))
 
 
+@pytest.mark.slow
 def test_every_flipped_bit_is_refused(capfd: pytest.CaptureFixture[str]) -> None:
     """No bit may be flipped and the file still be taken for a table, unused places included.
 
@@ -420,6 +421,7 @@ ODD = [
 ]
 
 
+@pytest.mark.slow
 def test_random_headers_and_pixels() -> None:
     """Hostile authors recompute digests: the answer is a finding, or a table that can be used."""
     rng = np.random.default_rng(2)

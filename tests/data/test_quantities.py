@@ -10,7 +10,8 @@ from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
 from tsdf.judge import analytic
 from tsdf.judge.equilibrium import reach_of_prism
-from tsdf.make import estimate, scatterometer
+from tsdf.make import assemble
+from tsdf.make.origin import grain_header
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.make.tally import Tally
 from tsdf.make.tracer import Tracer
@@ -26,7 +27,7 @@ def prisms() -> list[Table]:
         tally = Tally()
         Tracer(grain, 1.31, seed=seed).trace(np.arange(1 << 13), tally)
         made = {"command": "", "method": "traced", "seed": seed, "paths": 1 << 13, "max_bounces": 100_000}
-        tables.append(estimate.traced_table(tally, 64, scatterometer.grain_header(grain), Optics(1.31), made))
+        tables.append(assemble.traced_table(tally, 64, grain_header(grain), Optics(1.31), made))
     return tables
 
 

@@ -9,6 +9,7 @@ import pytest
 
 import tsdf
 from tsdf.errors import FormatWarning
+from tsdf.reference_data import make_golden
 from tsdf.reference_data.make_checks import CHECKS
 
 VALID = CHECKS.parent / "valid"
@@ -41,14 +42,26 @@ def by_mitsuba(path: Path) -> np.ndarray:
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.name.removesuffix(".tsdf.exr"))
 @pytest.mark.parametrize("reader", [by_openexr, by_openimageio, by_mitsuba])
 def test_readers_see_the_same_pixels(reader: Callable[[Path], np.ndarray], path: Path) -> None:
-    """Bit for bit, each golden file: raw and compressed chunks, extensions. None is the same upside down."""
+    """Bit for bit, each golden file: raw and compressed chunks, extensions."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FormatWarning)  # a newer minor version
         own = tsdf.read(path).pixels
     found = reader(path)
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, own)
-    assert not np.array_equal(own[::-1], own)
+
+
+@pytest.mark.parametrize("reader", [by_openexr, by_openimageio, by_mitsuba])
+def test_readers_would_see_other_pixels(reader: Callable[[Path], np.ndarray], tmp_path: Path) -> None:
+    """The control: of a file whose rows are upside down, or of which one number is the next float32, they say so."""
+    header, pixels = make_golden.table(make_golden.WEIGHTS)
+    other = pixels.copy()
+    other[2, 1] = np.nextafter(other[2, 1], np.float32(2.0))
+    for changed in (pixels[::-1], other):
+        (tmp_path / "t.exr").write_bytes(make_golden.file(header, changed))
+        found = reader(tmp_path / "t.exr")
+        np.testing.assert_array_equal(found, changed)
+        assert not np.array_equal(found, pixels)
 
 
 @pytest.mark.parametrize("reader", ["OpenImageIO", "mitsuba"])

@@ -158,6 +158,7 @@ def accepted(found):
     return min(found.values()) > 1.0 - (1.0 - ALPHA) ** (1.0 / len(found))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["cube", "sphere", "made up"])
 def test_every_axis_follows_the_table(kind, request):
     """chi-square of theta with its atoms, the marginals, and each conditional in several columns, Sidak-corrected.
@@ -396,6 +397,7 @@ def _draw_all(tables, t, joint, u, out):
         out[i, 6], out[i, 7] = column_of(tables, t, cos_theta), density(tables, column)
 
 
+@pytest.mark.slow
 def test_mixture(cube, sphere):
     """Tables of other sizes and edges, one after the other, each give what they give alone, for the same numbers."""
     u = np.random.default_rng(17).random((100_000, 6))

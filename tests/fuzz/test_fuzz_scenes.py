@@ -9,6 +9,7 @@ from tsdf.errors import SceneError
 from tsdf.picture import world
 
 
+@pytest.mark.slow
 def test_mutated_scenes_are_rendered_or_refused():
     """Nothing but our own errors, in one line, within the bounds of time and memory per scene."""
     found = scenes.run(60, seed=2, loud=False, warm=False)

@@ -302,6 +302,7 @@ def test_import_is_light():
 # ------------------------------------------------------------------------------------- normalisation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize("shift", [0.0, 1e3])
 def test_scale_and_place_do_not_matter(scale, shift):
@@ -433,9 +434,9 @@ def test_bodies_and_cavities():
 def test_many_bodies_are_fast():
     ball = mesh("octahedron")
     places = itertools.product(range(7), repeat=3)
-    begin = time.perf_counter()
+    begin = time.process_time()
     assert grain_from_mesh(*joined(*[moved(ball, 0.4, p) for p in places])).bodies == 343
-    assert time.perf_counter() - begin < 10
+    assert time.process_time() - begin < 10
 
 
 # ------------------------------------------------------------------------------------ what is refused
@@ -571,6 +572,7 @@ def lens(share):
     return d
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.3, 1e-2, 1e-3, 2e-4])
 def test_overlapping_spheres(share):
     ball = mesh("icosphere", subdivisions=5)
@@ -603,6 +605,7 @@ def sphere_on_a_grid(subdivisions, digits):
     return vertices.round(digits), faces
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(exemplars.EXEMPLARS))
 def test_convex_within_its_digits(name):
     """A convex crystal stays convex in float32, near and far, and in six decimals; a concave one stays concave."""
@@ -632,6 +635,7 @@ def test_a_dent_is_no_rounding():
     assert not grain_from_mesh(*voxels(np.array([[[1, 1], [1, 0]]], bool))).convex
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, 50e-6, 0.37])
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
 def test_digits_that_ran_out(scale, kind):
@@ -681,10 +685,10 @@ def test_crossing_check_is_fast_and_quiet():
         load_grain("hexprism", aspect=0.01),
         load_grain("snow", rounding=0),
     ):
-        begin = time.perf_counter()
+        begin = time.process_time()
         crossings = check_crossings(grain, seed=5)
         assert crossings.share == 0 and crossings.leaks < 1e-4
-        assert time.perf_counter() - begin < 5  # 0.4 s on a free machine
+        assert time.process_time() - begin < 5  # 0.4 s on a free machine
 
 
 def test_rays_are_checked():
@@ -786,6 +790,7 @@ def test_many_cavities_take_little():
     assert (found == 1).all() and effort < 100 * len(probes)  # of 20,480 facets
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", ["MOST_NESTED", "MOST_PAIRS"])
 def test_shells_within_shells_are_bounded(limit, monkeypatch):
     """Forty shells are told apart; of too many in each other's boxes the message says how many."""

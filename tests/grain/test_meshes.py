@@ -253,6 +253,7 @@ def test_ply_announces_more_than_it_holds(order, missing, tmp_path):
 # -------------------------------------------------------------------------------------------- polygons
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["l.obj", "l.off", "text.ply", "little.ply"])
 @pytest.mark.parametrize("turn", range(6))
 def test_concave_polygons(name, turn, tmp_path):
@@ -298,6 +299,7 @@ def outline_size(outline):
     return abs((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum()) / 2, np.linalg.norm(p - q, axis=1).sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bend", [0.0, 1e-3])
 @pytest.mark.parametrize("outline", [RING, STAR, L[::-1]], ids=["ring", "star", "l"])
 @pytest.mark.parametrize("turn", [0, 1, 3])
@@ -650,6 +652,7 @@ def inflated():
     return data + zlib.compress(bytes(1000))
 
 
+@pytest.mark.slow
 def test_small_files_that_stand_for_much(tmp_path):
     """Refused for what they are, within the stated memory and time."""
     loader = fuzz.Loader()
@@ -660,6 +663,7 @@ def test_small_files_that_stand_for_much(tmp_path):
     loader.close()
 
 
+@pytest.mark.slow
 def test_damaged_files():
     """A short form of fuzz/meshes.py: grains or errors of ours, and enough of both."""
     ends = fuzz.main(150, seed=1)

@@ -48,10 +48,11 @@ def test_the_tracer_agrees_where_prisms_are_not_all_reached():
     grain, tally = load_grain("hexprism"), Tally()
     Tracer(grain, 1.5, seed=1).trace(np.arange(1 << 16), tally)
     from tsdf.grain.optics import Optics
-    from tsdf.make import estimate, scatterometer
+    from tsdf.make import assemble
+    from tsdf.make.origin import grain_header
 
     made = {"command": "", "method": "traced", "seed": 1, "paths": 1 << 16, "max_bounces": 100_000}
-    table = estimate.traced_table(tally, 16, scatterometer.grain_header(grain), Optics(1.5), made)
+    table = assemble.traced_table(tally, 16, grain_header(grain), Optics(1.5), made)
     share, error = table.dark_share
     assert error < 0.005
     assert abs(share - (1.0 - reach_of_prism(1.5, 6))) <= 4.0 * error

@@ -16,8 +16,10 @@ from tsdf.data import format
 from tsdf.data.table import Table, thawed
 from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
-from tsdf.judge.validate import CODES, judge, reference, validate, zhou_curve
-from tsdf.make import estimate
+from tsdf.judge.court import CODES
+from tsdf.judge.physics import reference, zhou_curve
+from tsdf.judge.validate import judge, validate
+from tsdf.make import assemble
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.make.tally import Tally
 from tsdf.make.tracer import Tracer
@@ -37,7 +39,7 @@ def traced(
     shape = {key: getattr(grain, key) for key in ("kind", "name", "bounding_radius", "area", "volume", "convex")}
     shape |= {"parameters": {}, "bodies": grain.bodies, "faces": len(grain.faces), "mesh_sha256": None, "notes": []}
     made = {"command": "", "method": "traced", "seed": seed, "paths": paths, "max_bounces": 100_000}
-    return estimate.traced_table(tally, cells, shape, Optics(eta, fresnel), made, memory)
+    return assemble.traced_table(tally, cells, shape, Optics(eta, fresnel), made, memory)
 
 
 def errors(table: Table) -> set[str]:
@@ -120,6 +122,7 @@ def test_a_newer_minor_version_is_a_warning_of_the_structure():
 # --- sound tables, negative controls ------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "made",
     [
@@ -149,6 +152,7 @@ def test_honest_noisy_tables_pass(made):
     assert errors(traced(**made)) == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("eta", "fresnel"), [(1.31, "un"), (1.5, "sp"), (3.0, "un"), (0.75, "sp"), (1.0, "un")])
 @pytest.mark.parametrize("memory", [1, 32])
 def test_records_by_entry_of_exact_spheres_pass(eta, fresnel, memory):

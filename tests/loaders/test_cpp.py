@@ -175,6 +175,7 @@ def test_texts_and_numbers_at_their_bounds(program: Path, tmp_path: Path) -> Non
         assert batch(program, files, tmp_path) == [code] * len(files)
 
 
+@pytest.mark.slow
 def test_damaged_files_break_the_same_rule_in_both_readers(
     program: Path, tmp_path: Path, fuzzer: Callable[[str], ModuleType]
 ) -> None:
@@ -188,6 +189,7 @@ def test_damaged_files_break_the_same_rule_in_both_readers(
     assert not differ, differ[:5]
 
 
+@pytest.mark.slow
 def test_damaged_files_are_stood_under_sanitizers(tmp_path: Path, fuzzer: Callable[[str], ModuleType]) -> None:
     """No read out of bounds, no undefined behaviour: on damaged files, and in using those that are accepted."""
     flags = ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]

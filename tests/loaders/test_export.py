@@ -29,6 +29,7 @@ from tsdf.errors import FormatWarning
 from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
 from tsdf.loaders import export
+from tsdf.loaders.pointmedium import MOST_BOUNCES, PointMedium, bounces, lost, point_medium
 from tsdf.make import scatterometer
 from tsdf.make.scatterometer import Effort
 from tsdf.picture import image
@@ -131,6 +132,7 @@ def reflectance(sigma_a: float, sigma_s: float, moments: np.ndarray, thickness: 
 # ----------------------------------------------------------------------------------------------- numbers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("products", [(0.0,) * 3, (0.05,) * 3, (0.001, 0.02, 0.3)])
 def test_every_target_has_the_numbers_of_the_medium(cube: Table, products: tuple[float, float, float]) -> None:
     """Read back by each renderer's own rules, sigma_s and sigma_a are those of `volume_parameters`; g is within range.
@@ -217,17 +219,17 @@ def test_units() -> None:
 
 def test_two_lobes_only_where_needed(cube: Table) -> None:
     """One lobe where the fit is good, two where it is not and they are better."""
-    medium = export.bulk(cube, 0.6, 1.0)
+    medium = point_medium(cube, 0.6, 1.0)
     assert cube.header["fits"]["henyey_greenstein"]["total_variation"] > export.ENOUGH
     assert len(medium.lobes()) == 2 and len(medium.lobes(1)) == 1
     header = dict(cube.header)
     header["fits"] = dict(header["fits"]) | {"henyey_greenstein": {"g": 0.4, "total_variation": 0.01}}
-    assert len(export.bulk(Table(header, cube.pixels), 0.6, 1.0).lobes()) == 1
+    assert len(point_medium(Table(header, cube.pixels), 0.6, 1.0).lobes()) == 1
 
 
 def test_black_grains(ball: Table) -> None:
     """Grains that let nothing out still make a medium, one that only absorbs."""
-    request = export.Request(export.bulk(ball, 0.6, 1.0, Absorption("grey", (1e6,))))
+    request = export.Request(point_medium(ball, 0.6, 1.0, Absorption("grey", (1e6,))))
     for name, text in export.TEXTS.items():
         if name != "csv":
             assert "nan" not in text(request)
@@ -238,6 +240,7 @@ def test_black_grains(ball: Table) -> None:
 # ------------------------------------------------------------------------------------------- put back
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("product", [0.0, 0.02])
 def test_rendering_what_was_written_gives_the_level(ball: Table, product: float) -> None:
     """A slab of 40 R of the exported numbers, by discrete ordinates, reflects as our level volume-hg does.
@@ -245,9 +248,9 @@ def test_rendering_what_was_written_gives_the_level(ball: Table, product: float)
     Within 4 standard errors; a g that is 0.1 off is rejected, and so are half as much extinction again where nothing
     absorbs, and a quarter more absorption where something does.
     """
-    medium = export.bulk(ball, 0.6, 0.5, Absorption("grey", (product / 0.5,)))
+    medium = point_medium(ball, 0.6, 0.5, Absorption("grey", (product / 0.5,)))
     request = export.Request(medium)
-    found, error = export.measure(medium, 20.0, samples=100_000)["volume-hg"]
+    found, error = export.level_errors(medium, 20.0, samples=100_000)["volume-hg"]
     sigma_a, sigma_s, g = pbrt_medium(export.pbrt(request))
     moments = g**ORDERS
     of_pbrt = reflectance(sigma_a[0], sigma_s[0], moments, 20.0)
@@ -268,7 +271,7 @@ def test_two_lobes_are_nearer_where_the_shape_counts(cube: Table) -> None:
     """
     from scipy.special import eval_legendre
 
-    medium = export.bulk(cube, 0.3, 1.0)
+    medium = point_medium(cube, 0.3, 1.0)
     edges, masses = cube.cos_theta_edges, cube.p_theta
     width = np.diff(edges)
     table = [1.0]
@@ -290,20 +293,20 @@ def test_colour_of_a_material(ball: Table) -> None:
     of the absorption spectrum instead is rejected.
     """
     ice = Absorption("spectral", material="ice")
-    medium = export.bulk(ball, 0.6, 0.005, ice, 1.0)
+    medium = point_medium(ball, 0.6, 0.005, ice, 1.0)
     nm, weight = image.spectral_weights()
     spectrum = absorption_at(ice, nm, 1.0)
 
-    def deep(made: export.Bulk, i: int) -> float:
+    def deep(made: PointMedium, i: int) -> float:
         c = made.channels[i]
         return reflectance(c.sigma_a, c.sigma_s, c.g**ORDERS, 1e4 * 0.005)
 
-    by_wavelength = np.array([deep(export.Bulk(ball, 0.6, 0.005, (a, a, a)), 0) for a in spectrum])
+    by_wavelength = np.array([deep(PointMedium(ball, 0.6, 0.005, (a, a, a)), 0) for a in spectrum])
     truth = weight.T @ by_wavelength
     own = np.array([deep(medium, i) for i in range(3)])
     assert np.abs(own - truth).max() < 0.002
     red, green, blue = np.maximum(weight.T @ spectrum, 0.0).tolist()
-    mean = export.Bulk(ball, 0.6, 0.005, (red, green, blue))
+    mean = PointMedium(ball, 0.6, 0.005, (red, green, blue))
     assert np.abs(np.array([deep(mean, i) for i in range(3)]) - truth).max() > 0.01
 
 
@@ -334,12 +337,12 @@ def test_number_of_bounces(ball: Table, absorption: float) -> None:
 
     Half the number of bounces loses more than that, the negative control.
     """
-    medium = export.bulk(ball, 0.6, 1.0, Absorption("grey", (absorption,)))
+    medium = point_medium(ball, 0.6, 1.0, Absorption("grey", (absorption,)))
     c = medium.channels[0]
     walks = orders(c.g, 80.0 * c.sigma_t, 20_000)
     energy = c.albedo**walks
     for kept in (0.9, 0.99):
-        n = export.bounces(medium, kept, 80.0)
+        n = bounces(medium, kept, 80.0)
         tolerance = 0.1 * (1.0 - kept) + SIGMAS * math.sqrt((1.0 - kept) / len(walks))
         assert abs(energy[walks > n].sum() / energy.sum() - (1.0 - kept)) < tolerance
         assert energy[walks > n // 2].sum() / energy.sum() > 1.0 - kept + tolerance
@@ -347,10 +350,10 @@ def test_number_of_bounces(ball: Table, absorption: float) -> None:
 
 def test_bounces_are_monotone(ball: Table) -> None:
     """Thicker bodies and more light need more; a deep lossless body loses a known share, as 1/sqrt(n)."""
-    medium = export.bulk(ball, 0.6, 1.0)
-    counts = [export.bounces(medium, 0.99, t) for t in (1.0, 10.0, 100.0, math.inf)]
+    medium = point_medium(ball, 0.6, 1.0)
+    counts = [bounces(medium, 0.99, t) for t in (1.0, 10.0, 100.0, math.inf)]
     assert counts == sorted(counts) and counts[0] >= 1
-    assert export.lost(medium, 1000) / export.lost(medium, 4000) == pytest.approx(2.0, rel=0.03)
+    assert lost(medium, 1000) / lost(medium, 4000) == pytest.approx(2.0, rel=0.03)
     assert "1024 bounces lose" in export.blender(export.Request(medium))
 
 
@@ -387,7 +390,7 @@ def test_blender_snippet_runs(lobes: int) -> None:
     made = [call.args[0] for call in material.node_tree.nodes.new.call_args_list]
     assert made.count("ShaderNodeVolumeScatter") == lobes and made.count("ShaderNodeVolumeAbsorption") == 1
     assert made.count("ShaderNodeAddShader") == lobes
-    assert 12 <= bpy.context.scene.cycles.volume_bounces <= export.MOST_BOUNCES
+    assert 12 <= bpy.context.scene.cycles.volume_bounces <= MOST_BOUNCES
 
 
 @pytest.mark.parametrize("target", ["openpbr", "materialx"])
@@ -478,6 +481,28 @@ def test_npz_holds_the_records_by_entry(tmp_path: Path) -> None:
 GOOD = {"--to": "pbrt", "--packing": "0.6", "--radius": "1"}
 
 
+def test_sizes_densities_and_colours_in_any_word(cube: Table, tmp_path: Path) -> None:
+    """The medium that radius, packing and absorption say, said otherwise; both sides stand in the text."""
+    from tsdf.scene.deep import absorption_of_colour
+    from tsdf.scene.sizes import convert
+
+    facts = convert([(cube, 1.0)], {"radius": 0.5, "packing_fraction": 0.6}, 0.001).facts()
+    xs = absorption_of_colour(cube, (0.9, 0.5, 0.2))
+    ours = ("--radius", 0.5, "--packing", 0.6, "--absorption", ",".join(map(repr, xs)) + "/R")
+    theirs = ("--effective-radius", facts["effective_radius"], "--solid-fraction", facts["solid_fraction"])
+    a, b = (
+        run("--to", "pbrt", *words) for words in (ours, (*theirs, "--deep-colour", "0.9,0.5,0.2", "--unit", "0.001"))
+    )
+    assert b.exit_code == 0, b.stderr
+    for x, y in zip(pbrt_medium(a.stdout).values(), pbrt_medium(b.stdout).values(), strict=True):
+        assert y == (pytest.approx(x, rel=1e-6) if not isinstance(x, str) else x)
+    for part in ("effective_radius", "solid_fraction", "colour 0.9,0.5,0.2 where deep", "/ R = ", "/ unit = ", "/ m"):
+        assert part in b.stdout
+    own = tmp_path / "own.csv"
+    own.write_text("wavelength_nm,n,k\n300,1.5,1e-7\n900,1.5,1e-7\n")
+    assert run("--to", "pbrt", "--packing", 0.6, "--radius", 1, "--material", own, "--unit", 1e-3).exit_code == 0
+
+
 @pytest.mark.parametrize(
     "change, status, part",
     [
@@ -487,6 +512,11 @@ GOOD = {"--to": "pbrt", "--packing": "0.6", "--radius": "1"}
         ({"--radius": "0"}, 2, "--radius"),
         ({"--radius": "-1"}, 2, "--radius"),
         ({"--radius": "inf"}, 2, "--radius"),
+        ({"--sieve": "1"}, 2, "--radius, --sieve"),
+        ({"--density": "1"}, 2, "--packing, --density"),
+        ({"--deep-colour": "1"}, 2, "without any absorption it is 1"),
+        ({"--deep-colour": "0.5", "--absorption": "1"}, 2, "give one"),
+        ({"--material": "none.csv", "--unit": "1"}, 1, "none.csv: no such file"),
         ({"--to": "maya"}, 2, "'karma'"),
         ({"--to": "npz"}, 2, "--out"),
         ({"--absorption": "-1"}, 2, "--absorption"),
@@ -593,7 +623,7 @@ def test_blender_renders_the_medium(
     python = os.environ.get("TSDF_BLENDER_PYTHON")
     if not python:
         pytest.skip("no Blender: $TSDF_BLENDER_PYTHON names no Python that has bpy")
-    request = export.Request(export.bulk(cube, 0.6, 1.0), lobes)
+    request = export.Request(point_medium(cube, 0.6, 1.0), lobes)
     snippet, script, out = tmp_path / "medium.py", tmp_path / "slab.py", tmp_path / "out.exr"
     snippet.write_text(export.blender(request))
     script.write_text(SLAB)

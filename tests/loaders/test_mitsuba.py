@@ -164,6 +164,7 @@ CONSTANT = {"type": "constant"}
 ONE = (ConstantLight((1.0, 1.0, 1.0)),)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("body", ["box", "concave"])
 def test_furnace_is_exactly_one(body, variant, crystal, concave):
     """A constant 1 around grains that take nothing is 1 in every sample: no weight is lost or made, whatever the number
@@ -183,6 +184,7 @@ def test_absorbing_furnace_is_not_one(llvm, ball):
     assert np.array(mi.render(scene, spp=16)).min() < 0.99
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("body", ["box", "concave"])
 @pytest.mark.parametrize("absorption", [(0.05,), COLOURED])
 @pytest.mark.parametrize("grain", ["ball", "crystal"])
@@ -207,6 +209,7 @@ def directional(strength: float = 3.0) -> dict:
     return {"type": "directional", "direction": [-x for x in SUN], "irradiance": strength}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("body", ["box", "concave"])
 @pytest.mark.parametrize("absorption", [(0.0,), COLOURED])
 def test_tpt_is_our_renderer_under_a_sun(body, absorption, llvm, ball, concave):
@@ -239,6 +242,7 @@ def test_tpt_in_scalar_rgb(ball):
     assert abs(mean[..., 1].mean() - arbiter.rgb[..., 1].mean()) < 4.0 * both
 
 
+@pytest.mark.slow
 def test_area_light_is_environment(llvm, ball):
     """A sphere that shines inward all around is a constant light: from grains its light is found, from the floor it is
     drawn as well, and both must add up to the same."""
@@ -255,6 +259,7 @@ def test_area_light_is_environment(llvm, ball):
     assert abs(z) < 4.0
 
 
+@pytest.mark.slow
 def test_mixture_and_file_in_xml(llvm, ball, crystal, tmp_path):
     """A mixture named in XML is the same as ours; the control is the wrong shares."""
     for name, table in (("ball", ball), ("crystal", crystal)):
@@ -314,6 +319,7 @@ def test_stock_medium_keeps_the_mean_cosine(grain, absorption, llvm, request):
     assert abs(-cosine.mean() - parameters.g) > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("absorption", [0.0, 0.02])
 def test_stock_volpath_is_our_volume_level(absorption, llvm, ball):
     """Stock ``volpath`` with our medium against our level `volume`, under a sun and a sky; the control forgets the
@@ -479,6 +485,7 @@ def test_units_change_no_coloured_picture(variant, ball):
     assert picture(1.0, 2.0) != pytest.approx(one, rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rotation_deg", [0.0, 70.0])
 @pytest.mark.parametrize("target", [(1.0, 0.0, 0.2), (-0.6, 1.0, -0.3), (-1.0, -0.2, 0.0), (0.1, -1.0, 0.6)])
 def test_environments_are_those_of_mitsuba(target, rotation_deg, tmp_path):

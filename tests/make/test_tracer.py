@@ -10,10 +10,12 @@ from tsdf.data.blocks import MEMORY_FIELDS
 from tsdf.grain.grains import Grain, embree_scene, first_hit, grain_from_mesh, load_grain
 from tsdf.grain.horizon import horizon_of
 from tsdf.judge import analytic
-from tsdf.make import estimate
+from tsdf.make import statistics
 from tsdf.make import tally as T
+from tsdf.make.counting import arc
+from tsdf.make.records import entry_records_of
 from tsdf.make.tally import Tally
-from tsdf.make.tracer import Tracer, arc, in_order
+from tsdf.make.tracer import Tracer, in_order
 from tsdf.sampling import SOBOL, key_of, sobol, turn
 
 
@@ -63,6 +65,7 @@ def test_records_by_entry_change_nothing_else() -> None:
     assert having.memory == T.LEAST
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sphere", "cube", "tetrahedron", "sand", "snow"])
 @pytest.mark.parametrize("plain", [False, True])
 def test_no_energy_is_made_or_lost(name: str, plain: bool) -> None:
@@ -239,7 +242,7 @@ def test_hits_by_entry_of_a_cube() -> None:
     In 33 cells, which do not end where those of the tally do. Control: one cell further out is rejected by far.
     """
     columns, rays, paths = 33, 40_000, 200_000
-    hit = estimate.memory_of(traced(load_grain("cube"), paths, memory=1), columns, 1).hit
+    hit = entry_records_of(traced(load_grain("cube"), paths, memory=1), columns, 1).hit
     u = (np.arange(columns * rays) + 0.5) / (columns * rays)
     expected = cube_hits(u, 3).reshape(columns, rays).mean(axis=1)
     spread = np.maximum(expected * (1.0 - expected), 1.0 / rays)
@@ -250,6 +253,7 @@ def test_hits_by_entry_of_a_cube() -> None:
     assert hit.mean() == pytest.approx(2.0 / math.pi, abs=4.0 * math.sqrt(spread.mean() / paths))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sphere", "cube", "snow"])
 def test_as_much_light_enters_backwards_as_forwards(name: str) -> None:
     """What the records stand for is twice the light that met the grain in their cell: two unrelated counts.
@@ -290,7 +294,7 @@ def test_records_by_entry_of_a_sphere() -> None:
     Control: a sphere of another eta is rejected.
     """
     columns, count = 66, 256
-    records = estimate.memory_of(traced(load_grain("sphere"), 400_000, memory=count), columns, count).records
+    records = entry_records_of(traced(load_grain("sphere"), 400_000, memory=count), columns, count).records
     squares = {}
     for eta in (1.33, 1.40):
         truth = by_entry(eta, columns)
@@ -305,6 +309,7 @@ def test_records_by_entry_of_a_sphere() -> None:
     assert squares[1.33] < 1.0 + 4.0 * math.sqrt(2.0 / (4 * columns)) and squares[1.40] > 3.0, squares
 
 
+@pytest.mark.slow
 def test_handedness() -> None:
     """A grain and its mirror image have opposite azimuths: a propeller is not its own mirror image.
 
@@ -334,11 +339,11 @@ def deviations(tally: Tally, eta: float, fresnel: str) -> tuple[np.ndarray, floa
     """
     truth = analytic.sphere_statistics(eta, fresnel)
     sums = np.concatenate((tally.scalars, tally.theta[:, T.FINE :]), axis=1)
-    values, errors = estimate.jackknife(sums, estimate._scalar_statistics)
-    at = [estimate.STATISTICS.index(name) for name in ("mean_cosine", "mean_z", "mean_r", "mean_path_length")]
+    values, errors = statistics.jackknife(sums, statistics._scalar_statistics)
+    at = [statistics.STATISTICS.index(name) for name in ("mean_cosine", "mean_z", "mean_r", "mean_path_length")]
     exact = np.array((truth.mean_cosine, truth.mean_z, truth.mean_r, truth.mean_path_length))
-    columns = estimate.columns_of(tally.theta / tally.scalars[:, T.SCATTERED][:, None], 64)[:, 1:-1]
-    masses = analytic.deflection_masses(estimate.cos_theta_edges(64)[1:-1], eta, fresnel)
+    columns = statistics.columns_of(tally.theta / tally.scalars[:, T.SCATTERED][:, None], 64)[:, 1:-1]
+    masses = analytic.deflection_masses(statistics.cos_theta_edges(64)[1:-1], eta, fresnel)
     z = (columns.mean(axis=0) - masses) / (columns.std(axis=0, ddof=1) / 8.0)
     return (values[at] - exact) / errors[at], float((z**2).mean() * 61.0 / 63.0)
 
@@ -367,6 +372,7 @@ def test_conventions_are_told_apart() -> None:
     assert np.abs(z).max() > 8.0 and chi_square > 3.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["snow", "hexprism"])
 def test_both_estimators_agree(name: str) -> None:
     """Splitting, fans, horizons and Sobol' points change the noise and nothing else."""
@@ -375,7 +381,7 @@ def test_both_estimators_agree(name: str) -> None:
     for plain in (False, True):
         tally = traced(grain, 200_000, eta=1.31, plain=plain, seed=5)
         sums = np.concatenate((tally.scalars, tally.theta[:, T.FINE :]), axis=1)
-        results.append(estimate.jackknife(sums, estimate._scalar_statistics))
+        results.append(statistics.jackknife(sums, statistics._scalar_statistics))
     (ours, errors), (others, other_errors) = results
     differences = np.abs(ours - others) / np.maximum(np.hypot(errors, other_errors), 1e-12)
     assert differences[np.maximum(errors, other_errors) > 1e-9].max() < 4.0
@@ -391,10 +397,10 @@ def test_a_cavity_refracts_as_one() -> None:
     )
     assert shell.notes == ("1 cavity",)
     solid, hollow = (
-        estimate._scalar_statistics(np.concatenate((t.scalars, t.theta[:, T.FINE :]), axis=1).sum(axis=0))
+        statistics._scalar_statistics(np.concatenate((t.scalars, t.theta[:, T.FINE :]), axis=1).sum(axis=0))
         for t in (traced(ball, 50_000), traced(shell, 50_000))
     )
-    cosine, length = estimate.STATISTICS.index("mean_cosine"), estimate.STATISTICS.index("mean_path_length")
+    cosine, length = statistics.STATISTICS.index("mean_cosine"), statistics.STATISTICS.index("mean_path_length")
     assert hollow[length] < 0.25 * solid[length]
     # equilibrium: mean path length eta^2 V / (pi beta) or less where light is trapped
     assert hollow[length] < 1.33**2 * shell.volume / math.pi * 1.02

@@ -10,7 +10,8 @@ from tsdf.errors import UsageError
 from tsdf.grain.extent import maximum_dimension, sieve
 from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
-from tsdf.make import estimate, scatterometer
+from tsdf.make import assemble
+from tsdf.make.origin import grain_header
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.make.tally import Tally
 from tsdf.make.tracer import Tracer
@@ -30,7 +31,7 @@ def cube() -> Table:
     grain, tally = load_grain("cube"), Tally()
     Tracer(grain, 1.31, seed=1).trace(np.arange(1 << 14), tally)
     made = {"command": "", "method": "traced", "seed": 1, "paths": 1 << 14, "max_bounces": 100_000}
-    return estimate.traced_table(tally, 16, scatterometer.grain_header(grain), Optics(1.31, material="ice"), made)
+    return assemble.traced_table(tally, 16, grain_header(grain), Optics(1.31, material="ice"), made)
 
 
 def without(table: Table, *keys: str, material: str | None = "ice") -> Table:

@@ -42,6 +42,7 @@ def fcc(fraction: float, noise: float) -> tuple[np.ndarray, float]:
 # ------------------------------------------------------------------------------------------ the packing
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fraction", [1e-4, 0.2, 0.5, 0.625, MAX])
 def test_spheres_do_not_overlap(fraction: float) -> None:
     """All pairs with all images by plain arithmetic; the fraction is the one asked for, the bytes are repeated."""
@@ -75,6 +76,7 @@ def contact_value(packings: list[tuple[np.ndarray, float]]) -> tuple[float, floa
     return value, value * math.sqrt(covariance[-1, -1])
 
 
+@pytest.mark.slow
 def test_dense_fluid_has_the_contacts_of_the_equilibrium(packings: dict[float, Packing]) -> None:
     """g(2R) is Carnahan & Starling's (1969) within 4 standard errors at f = 0.45, and these are within 3 %.
 
@@ -181,6 +183,7 @@ def test_dense_packing_is_no_crystal(packings: dict[float, Packing]) -> None:
     assert second_shell(glass.centres, glass.side) < 1.2 < second_shell(crystal, side)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("spheres", "seed"), [(64, 0), (64, 1), (300, 2)])
 def test_densest_packing_is_made_of_any_number(spheres: int, seed: int) -> None:
     """At MAX, where random starts jam, fluids are compressed; some starts of few spheres jam, and others follow."""
@@ -189,6 +192,7 @@ def test_densest_packing_is_made_of_any_number(spheres: int, seed: int) -> None:
     assert packing.fraction == pytest.approx(MAX, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_densest_packing_is_no_crystal(packings: dict[float, Packing]) -> None:
     """Nor is the compressed fluid at 0.64, by the same measures, whose controls are those of the test above.
 
@@ -266,6 +270,7 @@ def rays(packing: Packing, kind: str, number: int) -> list[tuple[np.ndarray, np.
     return list(zip(origins[keep], directions, strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fraction", [0.02, 0.3, 0.6])
 @pytest.mark.parametrize("kind", ["random", "negative", "far", "axis", "plane", "nearly", "borders"])
 def test_walk_meets_what_brute_force_meets(fraction: float, kind: str) -> None:
@@ -399,7 +404,7 @@ def test_place_of_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.delenv("TSDF_CACHE", raising=False)
     for value, folder in ((str(tmp_path / "xdg"), "xdg/tsdf"), ("relative", ".cache/tsdf"), ("", ".cache/tsdf")):
         monkeypatch.setenv("XDG_CACHE_HOME", value)
-        assert module._folder() == tmp_path / folder
+        assert module.cache_folder() == tmp_path / folder
 
 
 @pytest.mark.parametrize("fraction", [0.0, -0.1, 0.6401, 1.0, math.nan, math.inf])

@@ -140,6 +140,7 @@ def test_absorption_can_be_taken_off_afterwards(table: Table, grain: GrainSpec) 
     assert abs(sums.mean[2 * each + 1] - own.transmittance) > SIGMAS * own.transmittance_error
 
 
+@pytest.mark.slow
 def test_memory_is_right_where_teleport_is_not(grain: GrainSpec) -> None:
     """In the bulk at packing fraction 0.5, packed spheres and teleport-memory agree within 4 standard errors and 0.5 %,
     which one packing of 2000 may differ by; teleport, the control, is slower by 5 %, and is rejected."""
@@ -190,7 +191,7 @@ def test_noise_of_a_profile_is_what_equal_profiles_differ_by(grain: GrainSpec) -
 
 def test_lost_paths_are_counted_and_left_out() -> None:
     """A path that did not come to its last block has no number; the mean is that of the others."""
-    nothing = experiment.Ends(*(np.zeros((0, 3)) for _ in range(3)), np.zeros(0), np.zeros((0, 0)), 0, 0.0)
+    nothing = experiment.Ends(*(np.zeros((0, 3)) for _ in range(3)), np.zeros(0), np.zeros((0, 0)), 0, 0, 0.0)
     sums = Sums()
     sums.add(np.array([[1.0], [math.nan], [3.0]]), nothing)
     assert (sums.paths, sums.lost, sums.mean[0]) == (2, 1, 2.0)
@@ -208,6 +209,7 @@ def small(grain: GrainSpec) -> accuracy.Accuracy:
     return measure(grain, [0.05], [10.0], paths=256, seed=3, threads=1)
 
 
+@pytest.mark.slow
 def test_every_number_has_a_row(small: accuracy.Accuracy) -> None:
     """Bulk, slabs at two angles and two albedos, times; the reports hold them; explicit deviates from nothing."""
     assert small.levels == accuracy.MEASURED and not small.notes and not small.interrupted
@@ -228,6 +230,7 @@ def test_every_number_has_a_row(small: accuracy.Accuracy) -> None:
     assert dark.value < light.value
 
 
+@pytest.mark.slow
 def test_the_same_request_gives_the_same_numbers(small: accuracy.Accuracy, grain: GrainSpec) -> None:
     again = measure(grain, [0.05], [10.0], paths=256, seed=3, threads=2)
     other = measure(grain, [0.05], [10.0], paths=256, seed=4)
@@ -239,6 +242,7 @@ def test_the_same_request_gives_the_same_numbers(small: accuracy.Accuracy, grain
     assert values(other) != values(small)
 
 
+@pytest.mark.slow
 def test_what_a_table_cannot_is_said() -> None:
     """Without records their levels are skipped, above 0.64 those that need packings; the rest has numbers, and without
     explicit no deviations. Above 0.64 alone nothing can be held against anything."""
@@ -255,6 +259,7 @@ def test_what_a_table_cannot_is_said() -> None:
     plots.plot_accuracy(accuracy.facts(found), found.fraction, found.name)
 
 
+@pytest.mark.slow
 def test_grains_that_let_no_light_in_have_no_absorbing_slabs() -> None:
     class Closed(Table):
         def albedo(self, absorption: float = 0.0) -> float:

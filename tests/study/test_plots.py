@@ -23,6 +23,7 @@ def axes_of(figure, title):
     return next(axes for axes in figure.axes if title in axes.get_title())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("draw", "suffix"), [(plots.plot_table, "pdf"), (plots.plot_validation, "png")])
 def test_same_table_same_bytes(tables, tmp_path, draw, suffix):
     first, second = tmp_path / f"a.{suffix}", tmp_path / f"b.{suffix}"

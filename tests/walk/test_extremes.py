@@ -97,6 +97,7 @@ EXTREMES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXTREMES)
 def test_media_and_exports(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Numbers of the medium are finite where light is let out, and each exporter has its say."""
@@ -115,6 +116,7 @@ def test_media_and_exports(name: str, tmp_path: Path, capsys: pytest.CaptureFixt
             assert not re.search(r"\b(nan|inf)\b", (tmp_path / target).read_text(), flags=re.I)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXTREMES)
 def test_judged_and_drawn(name: str, tmp_path: Path) -> None:
     """`tsdf-validate` has findings, or none; a picture is a picture."""

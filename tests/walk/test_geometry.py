@@ -130,6 +130,7 @@ def exact_distances(corners, points, nearest):
             nearest[i] = min(nearest[i], triangle_distance(corners[t], p))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["mesh", "slab", "box"])
 def test_clearance_is_a_bound(shape, bumpy, table):
     """At 3000 places of each medium nothing is nearer than the clearance, by exact distances to every facet; most

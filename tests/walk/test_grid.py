@@ -8,7 +8,7 @@ from numba import njit
 
 from tsdf.grain.grains import first_hit, load_grain, triangle_scene
 from tsdf.walk.geometry import planes_of
-from tsdf.walk.grid import OUTSIDE, Grid, compared, grid_of, march, plane_hit
+from tsdf.walk.grid import OUTSIDE, Grid, compared, grid_of, line_of, march, plane_hit
 
 RAYS = 4000
 THICK = 1e-6
@@ -23,8 +23,9 @@ def marched(grid, p, d, end, met, known):
 @njit
 def looked_at(grid, p, d, end, met):
     for i in range(p.shape[0]):
+        a, b = (p[i, 0], p[i, 1], p[i, 2]), (d[i, 0], d[i, 1], d[i, 2])
         for facet in range(grid.corners.shape[0]):
-            compared(grid, met[i], facet, (p[i, 0], p[i, 1], p[i, 2]), (d[i, 0], d[i, 1], d[i, 2]), end[i])
+            compared(grid, met[i], facet, a, b, line_of(a, b), end[i])
 
 
 def rays(grid: Grid, p: np.ndarray, d: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -57,6 +58,7 @@ def floor(z: float, size: float) -> np.ndarray:
     return np.array([[a, b, c], [a, c, d]], np.float64)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cells", [1, 60, 3000, 200_000])
 def test_first_facets(cells: int) -> None:
     """A dented ball over a floor that reaches far out of the grid: from anywhere, near and far, and short."""

@@ -37,6 +37,7 @@ from tsdf.scene.scene import (
     Sphere,
     SunLight,
     SurfaceSpec,
+    absorption_at,
 )
 from tsdf.spheres.packing import pack
 from tsdf.walk import explicit
@@ -126,6 +127,7 @@ def agree(a: Measured, b: Measured, sigmas: float = SIGMAS) -> bool:
 # ------------------------------------------------------------------------------- slabs of packed spheres
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fraction, thickness, truth, teleported, volume",
     [
@@ -200,6 +202,7 @@ def moments_of(table: Table, absorption: float) -> np.ndarray:
     return np.array(moments)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("albedo", [1.0, 0.99, 0.9])
 @pytest.mark.parametrize(
     "level, depth, mu",
@@ -282,7 +285,7 @@ def test_spectra(ball: Table) -> None:
     together = of(ice, 20_000)
     expected, variance = np.zeros(3), together.error**2
     wavelengths, weights = image.spectral_weights()
-    spectrum = world.absorption_at(ice, wavelengths, 0.02)
+    spectrum = absorption_at(ice, wavelengths, 0.02)
     built = world.build(
         scene_of(Slab(-30.0, 0.0), 0.6, (GrainSpec(ball, absorption=Absorption("grey", (1.0,))),), WHITE), "teleport"
     )
@@ -446,6 +449,7 @@ def box_distance(points: np.ndarray, low: Sequence[float], high: Sequence[float]
     return -np.linalg.norm(np.maximum(q, 0.0), axis=1) - np.minimum(q.max(axis=1), 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["grains", "centres"])
 @pytest.mark.parametrize("buried", [False, True])
 @pytest.mark.parametrize("kind", ["slab", "box", "sphere", "mesh"])

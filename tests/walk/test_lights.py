@@ -83,6 +83,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_density_integrates_to_one_and_is_drawn(case):
     """Draws by chi-square against the stated density, whose integral is 1.

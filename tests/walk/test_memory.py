@@ -15,8 +15,8 @@ from tsdf.make import scatterometer
 from tsdf.make.scatterometer import Effort
 from tsdf.picture import image, render, world
 from tsdf.scene.scene import Box, Camera, EnvironmentLight, GrainSpec, MediumSpec, Mesh, Scene, Slab
-from tsdf.spheres.neighbours import law
 from tsdf.spheres.packing import cells_of, next_sphere, pack
+from tsdf.spheres.packing_table import law
 from tsdf.study.experiment import diffusion, slab
 from tsdf.walk import memory
 from tsdf.walk.memory import begin, memory_of, onward, remembered
@@ -120,6 +120,7 @@ def remembering(fraction: float, table: Table) -> memory.Memory:
     return memory_of([law(fraction)], [fraction], [1.0], [[(table, 1.0)]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fraction", [0.1, 0.55])
 def test_flights_begin_anywhere_in_a_packing(ball: Table, fraction: float) -> None:
     """The way from a random point to the next sphere, and how that is entered, are distributed as in a packing.
@@ -170,6 +171,7 @@ def test_lines_through_missed_spheres_are_those_of_the_packing(ball: Table) -> N
 # ------------------------------------------------------------------------------------------------ the level
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cosine", [1.0, 0.5])
 def test_dense_slabs_are_those_of_single_grains(ball: Table, cosine: float) -> None:
     """Reflectance of thin, dense slabs against four packings; teleportation without memory is far off where light
@@ -186,6 +188,7 @@ def test_dense_slabs_are_those_of_single_grains(ball: Table, cosine: float) -> N
         assert apart((other.reflectance, other.reflectance_error), truth) > 6.0
 
 
+@pytest.mark.slow
 def test_cubes_diffuse_as_single_grains_do(cube: Table) -> None:
     """Grains that are often missed: mean squared displacement per event in the bulk, against two packings."""
     grain = GrainSpec(cube)
@@ -214,6 +217,7 @@ def test_grains_whole_inside_are_centres_inside_a_smaller_shape(ball: Table, abo
         assert apart(found[0], thick) > 4.0, level
 
 
+@pytest.mark.slow
 def test_mixtures_choose_by_number(ball: Table, cube: Table, above: Path) -> None:
     """A mixture of a grain with itself is that grain; of spheres and cubes, what single grains say."""
     alone = reflectance(Slab(-8.0, 0.0), 0.5, (GrainSpec(ball),), above, 60_000)

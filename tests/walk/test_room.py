@@ -33,6 +33,7 @@ def scene_of(path: Path, inside: str, radius: float = 1.0) -> Scene:
     return Scene(camera, (ConstantLight((1.0, 1.0, 1.0)),), (medium,))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cells", [500, 1_000_000])
 @pytest.mark.parametrize("inside", ["grains", "centres"])
 def test_room_in_a_ring(ring, inside, cells, monkeypatch) -> None:
@@ -64,6 +65,7 @@ def solid_angle(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     return result
 
 
+@pytest.mark.slow
 def test_media_reach_as_far_as_their_grains(ring) -> None:
     """Where centres are inside, the boundary that light meets holds every point of every grain that may stand there."""
     path, mesh = ring

@@ -36,8 +36,19 @@ from tsdf.walk import geometry, lights
 ONE = (ConstantLight((1.0, 1.0, 1.0)),)
 OUTSIDE = Camera((3.0, -30.0, 7.0), (0.0, 0.0, 0.0), 16, 12, fov_deg=30.0)
 INSIDE = Camera((0.3, -0.2, 0.1), (1.0, 0.5, 0.3), 8, 6, fov_deg=100.0)
-JUMPING = ("teleport", "teleport-joint", "teleport-memory", "volume", "explicit")  # one of each way to move
-MOST = {"explicit": 0.6, "teleport-memory": 0.64}  # packing fractions of quick packings, of tabulated ones
+JUMPING = (
+    "teleport",
+    "teleport-joint",
+    "teleport-memory",
+    "volume",
+    "explicit",
+    "teleport-packed",
+)  # one of each way to move
+MOST = {
+    "explicit": 0.6,
+    "teleport-packed": 0.6,
+    "teleport-memory": 0.64,
+}  # packing fractions of quick packings, of tabulated ones
 BOX = Box((-6.0, -5.0, -4.0), (6.0, 5.0, 4.0))
 
 # An L, extruded: a face of it sees another
@@ -172,13 +183,13 @@ def test_furnace_of_sampled_light(shape, level, folder, ball):
     mean, error = mean_of(picture)
     assert abs(mean - 1.0) <= min(max(4.0 * error, 1e-12), 5e-3)
     assert picture.rgb.max() < 2.0 * mean
-    assert (error > 0.0) == (level != "explicit")
+    assert (error > 0.0) == (not LEVELS[level].traits.packed)
 
 
 def test_furnace_notices_a_loss(folder, ball):
     """Negative control: grains that take 1e-3 of the light that goes through them fail the furnace's test."""
     scene = scene_of([Slab(-4.0, 4.0)], ball, lights=under(folder, "white"))
-    grain = replace(scene.media[0].grains[0], absorption=world.AbsorptionSpec("grey", (3e-3,)))
+    grain = replace(scene.media[0].grains[0], absorption=Absorption("grey", (3e-3,)))
     picture = take(replace(scene, media=(replace(scene.media[0], grains=(grain,)),)), "teleport", 64)
     mean, error = mean_of(picture)
     assert abs(mean - 1.0) > 4.0 * error
@@ -192,7 +203,7 @@ def test_furnace_at_any_packing(fraction, level, ball):
     assert (take(scene, level, 2).rgb == 1.0).all()
 
 
-@pytest.mark.parametrize("level", [x for x in LEVELS if x != "explicit"])
+@pytest.mark.parametrize("level", [x for x in LEVELS if not LEVELS[x].traits.packed])
 def test_furnace_of_optical_thickness_1000(level, ball):
     """In a slab of optical thickness 1000 and more, seen from its middle and from outside, no path is given up."""
     made = world.build(scene_of([Slab(-1200.0, 1200.0)], ball, fraction=0.64), level)
@@ -274,6 +285,7 @@ def meshed(scene: Scene, folder: Path) -> Scene:
     return replace(scene, media=(replace(medium, shape=Mesh(folder / "as_mesh.ply")),))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", JUMPING)
 @pytest.mark.parametrize("boundary", ["exact", "mesh"])
 @pytest.mark.parametrize("name", LEAKS)
@@ -363,7 +375,7 @@ def test_deep_steps_change_nothing(level, folder, ball, monkeypatch):
     assert agree(blind, expected)
 
 
-@pytest.mark.parametrize("level", ["teleport", "volume", "explicit"])
+@pytest.mark.parametrize("level", ["teleport", "volume", "explicit", "teleport-packed"])
 @pytest.mark.parametrize("shape", ["slab", "box", "ball"])
 def test_a_shape_alone_is_as_beside_others(shape, level, folder, ball):
     """What is answered on the spot in one exact shape alone is what looking step by step finds, to the last bit.
@@ -404,7 +416,7 @@ def test_buried_thing_shows_through_thin_grains(level, ball):
 # -------------------------------------------------------------------------------------------- same pictures
 
 
-@pytest.mark.parametrize("level", ["teleport", "explicit"])
+@pytest.mark.parametrize("level", ["teleport", "explicit", "teleport-packed"])
 def test_same_picture_for_any_threads(level, folder, ball):
     """The bytes of a picture depend on the seed and not on the number of threads."""
     made = world.build(scene_of([Mesh(folder / "box.ply")], ball, lights=under(folder, "above")), level)

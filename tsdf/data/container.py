@@ -1,7 +1,7 @@
 """The container that tables are kept in: an OpenEXR image with a header in JSON, as ``schema/SPEC.md`` lays down.
 
 What sections 2, 6, 7, 8 of it and the first half of 3 ask of every file stands here, whatever the file holds: what
-differs from one format to the next is a `Format`. The formats themselves are `format` (grains) and `neighbours`
+differs from one format to the next is a `Format`. The formats themselves are `format` (grains) and `packing_table`
 (packings).
 
 The reader takes the EXR apart itself, on purpose: the OpenEXR binding prints a warning and returns less when

@@ -98,6 +98,15 @@ def read(path: str | os.PathLike[str]) -> Table:
     -----
     FormatWarning
         If the file follows a newer minor version of the format.
+
+    Examples
+    --------
+    >>> import tsdf
+    >>> table = tsdf.read("cube.tsdf.exr")
+    >>> table
+    Table(cube, eta=1.31, 18 cells of cos theta)
+    >>> round(table.mean_cosine(), 4)
+    0.4737
     """
     return container.read(path, FORMAT)
 
@@ -121,6 +130,14 @@ def write(table: Table, path: str | os.PathLike[str]) -> None:
     ------
     TSDFError
         If the table breaks a rule of SPEC.md or the file cannot be written; nothing is left behind.
+
+    Examples
+    --------
+    >>> import tsdf
+    >>> table = tsdf.read("cube.tsdf.exr")
+    >>> tsdf.write(table, "copy.tsdf.exr")
+    >>> tsdf.read("copy.tsdf.exr").header == table.header
+    True
     """
     header = thawed(table.header)
     blocks = header.get("blocks")

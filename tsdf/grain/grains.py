@@ -138,6 +138,13 @@ def load_grain(source: str | Path, repair: bool | Literal["any"] = False, **para
         The source does not exist, cannot be read, or is not a closed, simple surface.
     UsageError
         A parameter is unknown or out of range.
+
+    Examples
+    --------
+    >>> import tsdf
+    >>> grain = tsdf.load_grain("hexprism", aspect=2.0)
+    >>> grain.kind, grain.faces.shape, grain.convex
+    ('mesh', (20, 3), True)
     """
     name = str(source)
     if name in EXEMPLARS:

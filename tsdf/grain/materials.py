@@ -272,6 +272,11 @@ def optical_constants(material: str, wavelength_nm: float) -> OpticalConstants:
         sucrose. n of sucrose is that of 589 nm throughout; n of quartz falls by 0.017 over the same range.
     wavelength_nm : float
         Wavelength [nm]. Outside the range of the material, or not a number: UsageError.
+
+    Examples
+    --------
+    >>> round(optical_constants("ice", 550.0).n, 4)
+    1.311
     """
     if material not in MATERIALS:
         raise UsageError(

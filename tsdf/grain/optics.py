@@ -41,6 +41,12 @@ class Optics:
     ------
     UsageError
         If eta is out of range or the convention is unknown.
+
+    Examples
+    --------
+    >>> import tsdf
+    >>> tsdf.Optics(1.31)
+    Optics(eta=1.31, fresnel='un', material=None, wavelength_nm=None, k=None, source=None)
     """
 
     eta: float

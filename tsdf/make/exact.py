@@ -17,21 +17,19 @@ from tsdf.errors import UsageError
 from tsdf.grain.optics import Optics
 from tsdf.judge import analytic
 from tsdf.make import tally as T
-from tsdf.make.estimate import (
+from tsdf.make.assemble import assemble
+from tsdf.make.factorisation import Factorisation
+from tsdf.make.records import SHIFT, EntryRecords, systematic
+from tsdf.make.statistics import (
     LEGENDRE,
     MAX_CELLS,
-    SHIFT,
     STATISTICS,
-    Factorisation,
-    Memory,
     TableError,
-    assemble,
     candidate_cells,
     cos_theta_edges,
     each,
     normalised,
     ratio,
-    systematic,
 )
 
 LEDGER_UNITS = 1 << 52  # energy units of an exact table
@@ -82,7 +80,7 @@ def _choose(weight, low, high, edges, totals, chosen):  # type: ignore[no-untype
             chosen[i, j] = chosen[i, taken[i] - 1] if taken[i] > 0 else 0
 
 
-def _memory(events: analytic.SphereEvents, eta: float, columns: int, count: int) -> Memory:
+def _memory(events: analytic.SphereEvents, eta: float, columns: int, count: int) -> EntryRecords:
     """Return `count` records for each of so many equal cells of entry_b2, evenly spaced in the running sum of weights.
 
     The sum runs through the orders one after the other, so that the records of a cell hold each with its share of the
@@ -101,7 +99,7 @@ def _memory(events: analytic.SphereEvents, eta: float, columns: int, count: int)
         places = (np.arange(count) + c * SHIFT % 1.0) / count * running[-1]
         chosen = members[np.minimum(np.searchsorted(running, places, side="right"), len(members) - 1)]
         records[:, :, c] = fields[:, chosen[np.argsort(events.entry_b2[chosen], kind="stable")]]
-    return Memory(np.ones(columns), records)
+    return EntryRecords(np.ones(columns), records)
 
 
 def _exact_width(optics: Optics, cells: int) -> float:

@@ -9,221 +9,37 @@ threads.
 
 import json
 import math
-import shlex
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tsdf import archive
+from tsdf import archive, files
 from tsdf.data.table import Table
 from tsdf.errors import GrainError, TSDFError, UsageError
 from tsdf.grain.grains import Grain
 from tsdf.grain.optics import Optics
-from tsdf.make import estimate
+from tsdf.make import assemble, statistics
 from tsdf.make import tally as T
-from tsdf.make.crew import PIECE, Crew, Round
+from tsdf.make.crew import Crew, Round
+from tsdf.make.effort import DEFAULT_CELLS, MAX_JOINT, MAX_PATHS, Effort
 from tsdf.make.exact import exact_table
+from tsdf.make.origin import canonical_command, grain_header, printable
+from tsdf.make.pace import ROUND_S, Pace, Progress
+from tsdf.make.spans import CHUNK_MIN, Spans, beginning, chunks, joined, size, without
 from tsdf.make.tally import Tally
-from tsdf.make.tracer import MAX_BOUNCES
 
-DEFAULT_PATHS = 4_000_000
-DEFAULT_CELLS = 256
-MIN_PATHS = 16 * T.REPLICATES  # fewer give no honest standard error
-MAX_PATHS = 1 << 36  # 6.9e10: 2^30 in each replicate, whose energy times path length stays below 2^63
-MAX_JOINT = 1024
 MAX_LEAK = 1e-4  # share of the light that may be lost or cut off before a grain is refused
-CHUNK_MIN, CHUNK_MAX = 1 << 13, 1 << 20
+SAVE_S = 5.0  # [s] the least between two saves of a part file
 REASONABLE = 10**10  # paths that a target may take; a day of two processors
-ROUND_S, SAVE_S = 1.0, 5.0  # how long a round of the threads should last, and the least between two saves [s]
 PART_VERSION = 3
 PART_LIMIT = 1 << 28  # bytes of a part file; with all the records there can be it has 2e8
-
-Spans = list[tuple[int, int]]  # first and last + 1 path number of each, ascending, none touching the next
-
-
-@dataclass(frozen=True)
-class Effort:
-    """How much to trace and what to keep.
-
-    Parameters
-    ----------
-    paths : int, optional
-        Number of paths, MIN_PATHS .. MAX_PATHS; DEFAULT_PATHS unless there is a target.
-    target_error : float, optional
-        Stop when the estimated total variation of p_theta is this small; in (0, 1).
-    cells : int, optional
-        Cells of theta, MIN_CELLS .. MAX_CELLS; DEFAULT_CELLS, or with a target the fewest that meet it.
-    joint : int
-        Joint records per cell of theta, 0 .. MAX_JOINT.
-    seed : int
-        0 .. 2^63 - 1.
-    max_bounces : int
-        Hits after which a path is cut off.
-    memory : int
-        Records per cell of entry_b2, 0 .. MAX_JOINT; there are as many cells as columns.
-
-    Raises
-    ------
-    UsageError
-        If a value is out of range.
-    """
-
-    paths: int | None = None
-    target_error: float | None = None
-    cells: int | None = None
-    joint: int = 0
-    seed: int = 0
-    max_bounces: int = MAX_BOUNCES
-    memory: int = 0
-
-    def __post_init__(self) -> None:
-        if self.paths is not None and not (MIN_PATHS <= self.paths <= MAX_PATHS):
-            raise UsageError(
-                f"the number of paths must be {MIN_PATHS} to {MAX_PATHS:.2g}, got {self.paths:.6g}: errors are told "
-                f"from {T.REPLICATES} independent samples, and counts must stay exact"
-            )
-        if self.target_error is not None and not (0.0 < self.target_error < 1.0):
-            raise UsageError(f"the target error is a total variation between 0 and 1, got {self.target_error:g}")
-        if self.paths is not None and self.target_error is not None:
-            raise UsageError("give a number of paths or a target error, not both")
-        if self.cells is not None and not (estimate.MIN_CELLS <= self.cells <= estimate.MAX_CELLS):
-            raise UsageError(
-                f"the cells of theta must be {estimate.MIN_CELLS} to {estimate.MAX_CELLS}, got {self.cells}"
-            )
-        if not (0 <= self.joint <= MAX_JOINT):
-            raise UsageError(f"the joint records per cell must be 0 to {MAX_JOINT}, got {self.joint}")
-        if not (0 <= self.memory <= MAX_JOINT):
-            raise UsageError(f"the records per cell of entry must be 0 to {MAX_JOINT}, got {self.memory}")
-        if not (0 <= self.seed < 1 << 63):
-            raise UsageError(f"the seed must be 0 to 2^63 - 1, got {self.seed}")
-        if not (1 <= self.max_bounces <= 10**9):
-            raise UsageError(f"the bounce limit must be 1 to 1e9, got {self.max_bounces}")
-
-    def resolved(self) -> "Effort":
-        """Return the effort with its defaults filled in."""
-        values = asdict(self)
-        if self.target_error is None:
-            values["paths"] = self.paths or DEFAULT_PATHS
-            values["cells"] = self.cells or DEFAULT_CELLS
-        return Effort(**values)
-
-
-def chunks(paths: int | None) -> Iterator[tuple[int, int]]:
-    """Yield the first and last + 1 path number of each chunk: an eighth of what is done, within limits, forever
-    unless the number of paths is given."""
-    end = MAX_PATHS if paths is None else paths
-    first = 0
-    while first < end:
-        size = min(max(first // 8 // CHUNK_MIN * CHUNK_MIN, CHUNK_MIN), CHUNK_MAX)
-        yield first, min(first + size, end)
-        first += size
-
-
-def joined(spans: Iterable[tuple[int, int]]) -> Spans:
-    """Return spans in order, those that touch as one."""
-    whole: Spans = []
-    for first, last in sorted(spans):
-        if whole and first <= whole[-1][1]:
-            whole[-1] = (whole[-1][0], max(last, whole[-1][1]))
-        else:
-            whole.append((first, last))
-    return whole
-
-
-def without(spans: Spans, done: Spans) -> Spans:
-    """Return what of `spans` is not in `done`."""
-    left, k = [], 0
-    for first, last in spans:
-        while k < len(done) and done[k][1] <= first:
-            k += 1
-        for begin, end in done[k:]:
-            if begin >= last:
-                break
-            if begin > first:
-                left.append((first, begin))
-            first = max(first, end)
-        if first < last:
-            left.append((first, last))
-    return left
-
-
-def beginning(spans: Spans, paths: int) -> Spans:
-    """Return the first so many paths of `spans`."""
-    found = []
-    for first, last in spans:
-        if paths <= 0:
-            break
-        found.append((first, min(last, first + paths)))
-        paths -= last - first
-    return found
-
-
-def size(spans: Iterable[tuple[int, int]]) -> int:
-    """Return how many paths there are."""
-    return sum(last - first for first, last in spans)
-
-
-def printable(text: str) -> str:
-    """Return text from outside as one line that a header can hold; file names may have line breaks in them."""
-    return text if text.isprintable() else ascii(text)[1:-1]
-
-
 GRAIN = {"kind", "name", "parameters", "notes"}  # what is asked of a grain that a part file describes
-
-
-def grain_header(grain: Grain) -> dict[str, Any]:
-    """Return the header's account of a grain."""
-    return {
-        "kind": grain.kind,
-        "name": printable(grain.name),
-        "parameters": dict(grain.parameters),
-        "bounding_radius": float(grain.bounding_radius),
-        "area": float(grain.area),
-        "volume": float(grain.volume),
-        "convex": bool(grain.convex),
-        "bodies": max(1, int(grain.bodies)),
-        "faces": len(grain.faces),
-        "mesh_sha256": grain.mesh_hash or None,
-        "notes": [printable(note)[:1000] for note in grain.notes[:256]],
-        **extent_header(grain),
-    }
-
-
-def extent_header(grain: Grain) -> dict[str, float]:
-    """Return how large a grain is across [R], to four decimals so that every machine finds the same."""
-    if grain.kind == "sphere":
-        return {"x_maximum_dimension": 2.0, "x_sieve": 2.0}
-    from tsdf.grain.extent import maximum_dimension, sieve
-
-    across = maximum_dimension(grain.vertices), sieve(grain.vertices)
-    return {"x_maximum_dimension": round(across[0], 4), "x_sieve": round(across[1], 4)}
-
-
-def canonical_command(grain: Mapping[str, Any], optics: Optics, effort: Effort, traced: bool) -> str:
-    """Return the command that makes the same table: no paths of this machine, no threads, no chunks, no target."""
-    words = ["tsdf-build", shlex.quote(grain["name"])]
-    words += ["--repair-any"] if any(note.startswith("repair") for note in grain["notes"]) else []
-    words += [f"--set {key}={value}" for key, value in grain["parameters"].items()]
-    if optics.material is not None:
-        words += [f"--material {shlex.quote(optics.material)}", f"--wavelength-nm {optics.wavelength_nm!r}"]
-    else:
-        words += [f"--eta {optics.eta!r}"]
-    words += [f"--fresnel {optics.fresnel}"] if grain["kind"] == "sphere" else []
-    words += ["--traced"] if traced and grain["kind"] == "sphere" else []
-    if traced:
-        words += [f"--paths {effort.paths}"] if effort.target_error is None else []
-        words += [f"--seed {effort.seed}", f"--max-bounces {effort.max_bounces}"]
-    words += [f"--target-error {effort.target_error!r}"] if effort.target_error is not None else []
-    words += [f"--cells {effort.cells}"] if effort.cells is not None else []
-    words += [f"--joint {effort.joint}"] if effort.joint else []
-    words += [f"--memory {effort.memory}"] if effort.memory else []
-    return " ".join(words)
 
 
 def exact_sphere(grain: Grain, optics: Optics, effort: Effort) -> Table:
@@ -244,60 +60,6 @@ def exact_sphere(grain: Grain, optics: Optics, effort: Effort) -> Table:
         "max_bounces": None,
     }
     return exact_table(cells, effort.target_error, effort.joint, header, optics, provenance, effort.memory)
-
-
-@dataclass
-class Progress:
-    """How far a build has come.
-
-    Attributes
-    ----------
-    paths : int
-        Paths done.
-    total : int, optional
-        Paths that it will take; with a target, as far as can be told.
-    rays : int
-        Rays traced since `Build.run` began.
-    error : TableError, optional
-        Of the table that would be made now.
-    """
-
-    paths: int = 0
-    total: int | None = None
-    rays: int = 0
-    error: estimate.TableError | None = None
-
-
-@dataclass
-class _Pace:
-    """How many paths a round should have: about ROUND_S of work, and no more than there is time for.
-
-    Parameters
-    ----------
-    deadline : float
-        When to stop, on the monotonic clock [s].
-    length : int
-        Paths of a round.
-    rate : float
-        Paths in a second; 0 as long as it is not known [1/s].
-    """
-
-    deadline: float
-    length: int = CHUNK_MIN
-    rate: float = 0.0
-
-    def next(self, under_way: int) -> int:
-        """Return the paths of the next round if so many are under way; 0 if there is no time for more."""
-        if not self.rate or math.isinf(self.deadline):
-            return self.length
-        left = int((self.deadline - time.monotonic()) * self.rate) - under_way
-        return min(self.length, left) if left >= PIECE else 0
-
-    def learn(self, paths: int, seconds: float) -> None:
-        """Take note of how long a round took."""
-        self.rate = paths / max(seconds, 1e-6)
-        if paths == self.length and seconds < 0.5 * ROUND_S:
-            self.length *= 2
 
 
 @dataclass(eq=False)
@@ -325,7 +87,7 @@ class Build:
     tally: Tally
     done: Spans = field(default_factory=list)
     judgement: int = CHUNK_MIN
-    _latest: tuple[int, estimate.TableError] | None = None
+    _latest: tuple[int, statistics.TableError] | None = None
 
     @classmethod
     def start(cls, grain: Grain, optics: Optics, effort: Effort) -> "Build":
@@ -343,7 +105,7 @@ class Build:
         """What decides what the paths are; they serve every request of the same origin."""
         return {
             "part_version": PART_VERSION,
-            "software": estimate.software(),
+            "software": files.software(),
             "grain": self.grain,
             "optics": asdict(self.optics),
             "seed": self.effort.seed,
@@ -379,12 +141,12 @@ class Build:
         same = (self.effort.target_error, self.effort.cells) == (stored.effort.target_error, stored.effort.cells)
         self.judgement = stored.judgement if same else 0
 
-    def error(self) -> estimate.TableError | None:
+    def error(self) -> statistics.TableError | None:
         """Return the error of the table that would be made now, with the cells it would have."""
         if not self.tally.scalars[:, T.SCATTERED].any():
             return None
         if self._latest is None or self._latest[0] != self.paths:
-            errors, target = estimate.TableErrors(self.tally, self.effort.cells), self.effort.target_error
+            errors, target = statistics.TableErrors(self.tally, self.effort.cells), self.effort.target_error
             self._latest = self.paths, (errors.fewest(target) if target is not None else None) or errors.best()
         return self._latest[1]
 
@@ -402,7 +164,7 @@ class Build:
         self.judgement = following
         if not self.tally.scalars[:, T.SCATTERED].all():
             return False
-        errors = estimate.TableErrors(self.tally, self.effort.cells)
+        errors = statistics.TableErrors(self.tally, self.effort.cells)
         progress.error = errors.fewest(target) or errors.rough()
         if progress.error.total_variation <= target:
             progress.total = self.judgement = paths
@@ -410,7 +172,7 @@ class Build:
         least, needed = (times * paths for times in errors.needed(target))
         sure = progress.error.sampling_noise < 0.5 * target
         if math.isinf(least) or (sure and least > REASONABLE):
-            finest = errors(self.effort.cells or estimate.MAX_CELLS)
+            finest = errors(self.effort.cells or statistics.MAX_CELLS)
             more = "allow more --cells, or give" if self.effort.cells else "give"
             raise UsageError(
                 f"--target-error {target:g} is out of reach"
@@ -520,7 +282,7 @@ class Build:
                     reflectance_scale)  # fmt: skip
         tracing.set()
         under_way: deque[Round] = deque()
-        pace, ahead, before, saved = _Pace(deadline), self.done, time.monotonic(), -math.inf
+        pace, ahead, before, saved = Pace(deadline), self.done, time.monotonic(), -math.inf
         with crew:
             while True:
                 while len(under_way) < 2 and not leave.is_set():
@@ -635,7 +397,7 @@ class Build:
             "max_bounces": made.max_bounces,
         }
         tally = self.tally.narrowed(made.joint, made.memory)
-        return estimate.traced_table(tally, error.cells, self.grain, self.optics, provenance, made.memory)
+        return assemble.traced_table(tally, error.cells, self.grain, self.optics, provenance, made.memory)
 
     def save(self, path: Path) -> None:
         """Write the part file, atomically.
@@ -665,7 +427,7 @@ class Build:
         try:
             arrays = archive.read(path, PART_LIMIT)
             request = json.loads(arrays.pop(archive.PART).tobytes())
-            if (request["part_version"], request["software"]) != (PART_VERSION, estimate.software()):
+            if (request["part_version"], request["software"]) != (PART_VERSION, files.software()):
                 made = printable(str(request["software"]))[:100]
                 raise TSDFError(f"{path}: made by another version ({made}): build it again")
             kept, done = arrays.pop("records_kept"), arrays.pop("done")

@@ -4,7 +4,7 @@ A `Tally` is a set of int64 arrays plus, if asked for, reservoirs of records by 
 fixed-point: a path starts with `UNIT` units of energy and every split of them is exact, so that the energy ledger
 balances to the last unit and the sum over threads, chunks and machines does not depend on their order.
 
-Cells of theta are uniform in theta, ascending from 0, with the forward and the backward atom last; `estimate` turns
+Cells of theta are uniform in theta, ascending from 0, with the forward and the backward atom last; `assemble` turns
 them into the columns of a table. Lengths are in units of the bounding radius R, angles in radians.
 """
 

@@ -17,6 +17,7 @@ from tsdf.scene.medium import Component, volume_parameters
 from tsdf.scene.scene import Absorption, Camera, EnvironmentLight, GrainSpec, MediumSpec, Scene, Slab
 
 VIEWS = 6  # directions from which it is looked, at Gauss's nodes in the cosine
+WIDTH = 40.0  # [R] of a beam, so that explicit grains are met everywhere
 DEEP = 12.0  # [diffusion lengths] e^-12 of the light passes
 FEWEST = 40.0  # [R] a layer of few grains is none at levels that jump
 
@@ -71,7 +72,7 @@ def rendered(
         image.write_exr(sky, np.array([[[1.0] * 3], [[0.0] * 3]]))
         built = world.build(Scene(camera, (EnvironmentLight(sky),), (body,), name="colour"), level)
         for view, (mu, weight) in enumerate(zip(cosines.tolist(), weights.tolist(), strict=True)):
-            beam = world.beam(built, (0.0, 0.0, 2.0), (math.sqrt(1.0 - mu * mu), 0.0, -mu))
+            beam = world.beam(built, (0.0, 0.0, 2.0 + WIDTH), (math.sqrt(1.0 - mu * mu), 0.0, -mu), WIDTH)
             seen = render.measure(built, beam, spp=samples, seed=seed * VIEWS + view, threads=threads)
             rgb += 2.0 * weight * mu * seen.rgb[0, 0]
             variance += (2.0 * weight * mu) ** 2 * seen.variance[0, 0]

@@ -24,7 +24,7 @@ from tsdf.files import replacing
 
 MAGIC = b"\x76\x2f\x31\x01"
 MAX_SIDE = 2**16
-MAX_PIXELS = 2**27
+MAX_IMAGE = 2**27
 MAX_EXPOSURE = 128.0  # [stops]
 WAVELENGTHS_NM = tuple(float(nm) for nm in range(385, 780, 10))
 WINDOWS = ("dataWindow", "displayWindow")
@@ -88,6 +88,12 @@ def write_exr(
         If shapes are wrong or an attribute is not text.
     TSDFError
         If the file cannot be written.
+
+    Examples
+    --------
+    >>> write_exr("grey.exr", [[[0.5, 0.5, 0.5]]], attributes={"made_by": "me"})
+    >>> read_exr("grey.exr").attributes["made_by"]
+    'me'
     """
     import OpenEXR
 
@@ -124,6 +130,12 @@ def read_exr(path: str | os.PathLike[str]) -> Image:
     TSDFError
         If there is no such file, it is not an OpenEXR image of colour, or it is truncated. Not all damage can be
         seen: OpenEXR has no checksums.
+
+    Examples
+    --------
+    >>> image = read_exr("sky.exr")
+    >>> image.rgb.shape, image.variance is None
+    ((4, 8, 3), True)
     """
     return _read(path, math.inf)[0]
 
@@ -431,14 +443,14 @@ def _pixels(rgb: npt.ArrayLike, name: str) -> np.ndarray:
         pixels = np.asarray(rgb).astype(np.float32)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or not _readable(pixels.shape[0], pixels.shape[1]):
         raise UsageError(
-            f"{name} must have the shape (h, w, 3), 1 to {MAX_SIDE} pixels a side and {MAX_PIXELS} in all, "
+            f"{name} must have the shape (h, w, 3), 1 to {MAX_SIDE} pixels a side and {MAX_IMAGE} in all, "
             f"not {pixels.shape}"
         )
     return pixels
 
 
 def _readable(height: int, width: int) -> bool:
-    return min(height, width) > 0 and max(height, width) <= MAX_SIDE and height * width <= MAX_PIXELS
+    return min(height, width) > 0 and max(height, width) <= MAX_SIDE and height * width <= MAX_IMAGE
 
 
 def _size(window: Any) -> tuple[int, int]:

@@ -20,9 +20,13 @@ import numpy as np
 
 from tsdf.errors import SceneError, UsageError
 from tsdf.handle import Handle
+from tsdf.picture.trust import Moments, Trust, kurtosis_of
 from tsdf.picture.world import World, camera_of, sees
+from tsdf.scene.levels import LEVELS
+from tsdf.walk import packed
 from tsdf.walk import transport as T
 from tsdf.walk import walker as W
+from tsdf.walk.hybrid import ALL
 from tsdf.walk.transport import Camera
 
 SLOTS = 2048  # walkers under way at once, per thread, but for shadows: their state stays in the second-level cache
@@ -55,6 +59,10 @@ class Picture:
         Paths given up because nothing let their light out, and rays that lost track of a surface.
     interrupted : bool
         Whether it is less than what was asked for because the user stopped it.
+    leapt, leaps : int
+        How many of the events were not drawn one by one, and how many leaps stand for them.
+    trust : Trust, optional
+        Whether its variance is to be believed; None where there is no variance, or nobody has looked.
     """
 
     rgb: np.ndarray
@@ -66,6 +74,9 @@ class Picture:
     truncated: int
     faults: int
     interrupted: bool
+    leapt: int = 0
+    leaps: int = 0
+    trust: Trust | None = None
 
     @property
     def relative_error(self) -> float:
@@ -85,26 +96,32 @@ class Walkers:
         Walkers under way, and what they were.
     radiance : (n, 3) float64
         Found so far by each sample; `reserve` makes room.
-    counters : (4,) int64
+    counters : (6,) int64
         See `walker.EVENTS`.
     """
 
     def __init__(self, world: World) -> None:
-        self.arrays = Handle(
-            T.WorldArrays(
-                world.place.arrays, world.place.room, world.media, world.tables, world.lights, world.packed.arrays,
-                world.memory, world.absorption,
-            )
+        near = T.WorldArrays(
+            world.place.arrays, world.place.room, world.media, world.tables, world.lights, world.packed.arrays,
+            world.memory, world.leaps, world.absorption,
         )  # fmt: skip
-        self.place, self.packed = world.place, world.packed
-        engines, exemplars = len(self.place.engines), len(self.packed.engines)
+        self.near = self.arrays = Handle(near)
+        if 0 < world.media.singles < ALL:  # another level's law takes over, where it may have more or less room
+            self.near = Handle(near._replace(media=world.media._replace(traits=LEVELS["explicit"].traits)))
+            self.arrays = Handle(near._replace(geometry=world.brim.arrays))
+        self.place, self.brim, self.packed = world.place, world.brim, world.packed
+        self.answered = world.media.traits.answered
+        exemplars = len(self.packed.engines)
         self.walkers = [np.zeros(ROOM, W.WALKER) for _ in range(2)]
         self.amounts = [np.zeros((ROOM, world.amounts)) for _ in range(2)]
-        self.hits = np.full((ROOM + 1, engines), -1, np.int32)
+        self.near_hits = np.full((ROOM + 1, len(self.place.engines)), -1, np.int32)
+        self.hits = self.near_hits
+        if self.brim is not self.place:
+            self.hits = np.full((ROOM + 1, len(self.brim.engines)), -1, np.int32)
         self.grain_hits = np.full((exemplars, ROOM), -1, np.int32)
         self.starts, self.ways = (np.zeros((ROOM, 3), np.float32) for _ in range(2))
         self.grain_starts, self.grain_ways = (np.zeros((exemplars, ROOM, 3), np.float32) for _ in range(2))
-        self.counters = np.zeros(4, np.int64)
+        self.counters = np.zeros(6, np.int64)
         self.asked = np.zeros(W.GRAINS_ASKED + exemplars, np.int64)
         self.radiance = np.zeros((0, 3))
         self.reserve(1)
@@ -113,14 +130,23 @@ class Walkers:
         """Let so many samples have found nothing yet."""
         if len(self.radiance) < samples:
             self.radiance = np.zeros((samples, 3))
-            self.batches = [Handle(batch) for batch in (self._batch(0, 1), self._batch(1, 0))]
+            self._lay_out()
         self.radiance[:samples] = 0.0
 
-    def _batch(self, now: int, then: int) -> W.Batch:
-        return W.Batch(
-            self.walkers[now], self.amounts[now], self.walkers[then], self.amounts[then], self.hits, self.grain_hits,
-            self.starts, self.ways, self.grain_starts, self.grain_ways, self.radiance, self.counters, self.asked,
-        )  # fmt: skip
+    def _lay_out(self) -> None:
+        """Make the handles of both directions, and those of the single grains, whose ray engine is another."""
+        batches = [
+            W.Batch(
+                self.walkers[now], self.amounts[now], self.walkers[then], self.amounts[then], self.hits,
+                self.grain_hits, self.starts, self.ways, self.grain_starts, self.grain_ways, self.radiance,
+                self.counters, self.asked,
+            )
+            for now, then in ((0, 1), (1, 0))
+        ]  # fmt: skip
+        self.batches = [Handle(batch) for batch in batches]
+        self.near_batches = self.batches.copy()
+        if self.hits is not self.near_hits:
+            self.near_batches = [Handle(batch._replace(hits=self.near_hits)) for batch in batches]
 
     def follow(self, job: T.Job, pixels: int, stop: threading.Event) -> np.ndarray:
         """Return the radiance (pixels, spp, 3) of the samples of a job, of so many pixels.
@@ -145,15 +171,19 @@ class Walkers:
     def turn(self, live: int) -> int:
         """Take the first `live` of ``walkers[0]`` as far as they come without the ray engine, ask it, and return how
         many go on; ``walkers[1]`` then holds what they were, those that have ended as they ended."""
-        T.advance(self.arrays, self.batches[0], live)
+        if self.answered:
+            packed.answer(self.arrays, self.batches[0], live)
+        T.advance(self.near, self.arrays, self.near_batches[0], self.batches[0], live)
         live, rays = int(self.asked[W.LIVE]), int(self.asked[W.ASKED])
         if rays:
-            self.place.hits(self.starts[:rays], self.ways[:rays], self.hits.T)
+            self.place.hits(self.starts[:rays], self.ways[:rays], self.near_hits.T)
+            if self.brim is not self.place:
+                self.brim.hits(self.starts[:rays], self.ways[:rays], self.hits.T)
         for e, asked in enumerate(self.asked[W.GRAINS_ASKED :]):
             if asked:
                 starts, ways = self.grain_starts[e, :asked], self.grain_ways[e, :asked]
                 self.grain_hits[e, :asked] = self.packed.hits(e, starts, ways)
-        for pair in (self.batches, self.walkers, self.amounts):
+        for pair in (self.batches, self.near_batches, self.walkers, self.amounts):
             pair.reverse()
         return live
 
@@ -215,7 +245,8 @@ def measure(
     goal = Goal(spp, seconds, target_error)
     threads = threads or os.cpu_count() or 1
     stop, halt = stop or threading.Event(), threading.Event()
-    sums, count = Sums(width, height), width * height
+    met = world.media.traits.packed and bool(world.scene.media) and world.lights.sampled  # by chance alone
+    sums, count = Sums(width, height, kurtosis_of(world.lights) if met else 0.0), width * height
     pool = [Walkers(world) for _ in range(threads)]
     pool[0].follow(T.Job(camera, 0, 1, 0, seed), 1, halt)  # compiles, outside the time
     for walkers in pool:
@@ -223,7 +254,7 @@ def measure(
     free = list(pool)
     begin = time.perf_counter()
 
-    def follow(block: Block) -> np.ndarray:
+    def follow(block: Portion) -> np.ndarray:
         mine = free.pop()
         try:
             return mine.follow(T.Job(camera, block.pixel, block.number, block.sample, seed), block.pixels, halt)
@@ -263,7 +294,7 @@ def measure(
 # ------------------------------------------------------------------------------------- passes, and when to stop
 
 
-class Block(NamedTuple):
+class Portion(NamedTuple):
     """Samples that one thread takes at once: first pixel, pixels, samples of each and the number of the first."""
 
     pixel: int
@@ -272,25 +303,25 @@ class Block(NamedTuple):
     sample: int
 
 
-def _blocks(count: int, done: int, share: int) -> Iterator[Block]:
+def _blocks(count: int, done: int, share: int) -> Iterator[Portion]:
     """Yield the blocks of a pass of `share` samples over `count` pixels, each of which has `done` of them already."""
     size = min(max(share * count // PARTS, LEAST), BLOCK)
     number = min(share, size)
     step = max(1, size // number)
     for sample in range(done, done + share, number):
         for pixel in range(0, count, step):
-            yield Block(pixel, min(step, count - pixel), min(number, done + share - sample), sample)
+            yield Portion(pixel, min(step, count - pixel), min(number, done + share - sample), sample)
 
 
 def _in_turn(
     executor: ThreadPoolExecutor,
-    follow: Callable[[Block], np.ndarray],
-    coming: Iterator[Block],
+    follow: Callable[[Portion], np.ndarray],
+    coming: Iterator[Portion],
     at_once: int,
     stop: threading.Event,
-) -> Iterator[tuple[Block, np.ndarray]]:
+) -> Iterator[tuple[Portion, np.ndarray]]:
     """Yield blocks and what `follow` returns of each, in their order, until `stop` is set; so many are under way."""
-    waiting: deque[tuple[Block, Future]] = deque()
+    waiting: deque[tuple[Portion, Future]] = deque()
     while not stop.is_set():
         while len(waiting) < at_once and (block := next(coming, None)):
             waiting.append((block, executor.submit(follow, block)))
@@ -313,23 +344,28 @@ class Sums:
     total, squares : (h * w, 3) float64
         Of radiance, and of its square.
     samples : (h * w,) int64
+    moments : Moments
+    kurtosis : float
+        Of the lights that are met by chance alone, see `trust.kurtosis_of`; 0 where there are none.
     """
 
-    def __init__(self, width: int, height: int) -> None:
+    def __init__(self, width: int, height: int, kurtosis: float = 0.0) -> None:
         self.shape = (height, width, 3)
         self.total, self.squares = np.zeros((width * height, 3)), np.zeros((width * height, 3))
         self.samples = np.zeros(width * height, np.int64)
+        self.moments, self.kurtosis = Moments(width * height), kurtosis
 
     @property
     def black(self) -> bool:
         """Whether no sample has found light yet."""
         return not self.total.any()
 
-    def add(self, block: Block, radiance: np.ndarray) -> None:
+    def add(self, block: Portion, radiance: np.ndarray) -> None:
         """Add the radiance (pixels, number, 3) of a block."""
         own = slice(block.pixel, block.pixel + block.pixels)
         self.total[own] += radiance.sum(axis=1)
         self.squares[own] += (radiance**2).sum(axis=1)
+        self.moments.add(own, self.samples[own], radiance)
         self.samples[own] += block.number
 
     def picture(self, counters: np.ndarray, seconds: float, interrupted: bool) -> Picture:
@@ -346,8 +382,11 @@ class Sums:
             rays=int(counters[W.RAYS]),
             seconds=seconds,
             truncated=int(counters[W.TRUNCATED]),
+            leapt=int(counters[W.LEAPT]),
+            leaps=int(counters[W.LEAPS]),
             faults=int(counters[W.FAULTS]),
             interrupted=interrupted,
+            trust=self.moments.trust(self.samples, self.shape[:2], self.kurtosis) if self.samples.max() > 1 else None,
         )
 
 

@@ -3,13 +3,14 @@
 Media become numbers in `media`; how light uses them is `transport`, pictures are `render`. The levels, cheapest first:
 isotropic (point scatterers, similarity), volume-hg (one Henyey-Greenstein lobe), volume (tabulated deflections),
 teleport (Algorithm 1 of Meng et al. 2015), teleport-joint (its offsets kept together), teleport-memory (where
-neighbours are as well), explicit (packed grains, traced).
+neighbours are as well), teleport-packed (packed grains, answered by records), explicit (packed grains, traced).
 """
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import assert_never
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,11 +18,12 @@ from numpy.typing import ArrayLike
 from tsdf.data import format
 from tsdf.data.sampler import Tables, compile_tables
 from tsdf.data.table import Table
-from tsdf.errors import SceneError, TSDFError
+from tsdf.errors import SceneError, TSDFError, UsageError
 from tsdf.grain.grains import first_hit, load_grain
 from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.picture import image
+from tsdf.picture.leaping import GAMMA, checked, leaping
 from tsdf.picture.media import DARKEST, media_of, spectra_of
 from tsdf.scene.levels import LEVELS, Traits
 from tsdf.scene.medium import Component, VolumeParameters, free_path
@@ -37,16 +39,21 @@ from tsdf.scene.scene import (
     SunLight,
     called,
 )
-from tsdf.spheres.neighbours import law
+from tsdf.scene.sizes import MATERIAL_DENSITY, InWords, grain_sizes
+from tsdf.spheres.packing_table import law
 from tsdf.vectors import frame
 from tsdf.walk.explicit import Packed, nothing_packed, packed
 from tsdf.walk.geometry import MESH, Place, Triangles, ball_hit, exact_hit, place
+from tsdf.walk.hybrid import hybrid_notes, singles_of
+from tsdf.walk.leaps import Leaps
 from tsdf.walk.lights import LightArrays, compile_lights
 from tsdf.walk.memory import Memory, memory_of
 from tsdf.walk.transport import Camera
 from tsdf.walk.walker import MAX_EVENTS, Absorption, Media
 
 CAPTIVES = 32  # paths that look for a way out from the camera
+OUTLIVED = 1000.0  # of the grains met in the mean, after which a path that leaps is given up: no light lives as long
+MOST_EVENTS = 1 << 60  # that a walker counts
 BOUNCES = 500  # after which there is none; a hole of a thousandth of all surfaces is found by then
 SLOW = 1e5  # grains met by a path, beyond which it is said how long that takes
 ENDLESS = 1e7  # beyond which a path takes seconds
@@ -62,11 +69,15 @@ class World:
     ----------
     scene : Scene
     level : str
+    leap : float
+        Radius of the smallest leap in transport mean free paths, 0 where no medium is deep enough.
     place : Place
         Geometry and its ray engine.
+    brim : Place
+        Where the chain goes on after the first grains if that is another place: media that it fills to the brim.
     packed : Packed
-        Grains of the explicit level.
-    media, tables, memory, lights, absorption
+        Grains that are met one by one.
+    media, tables, memory, leaps, lights, absorption
         Arrays for kernels.
     amounts : int
         How many amounts of matter a walker counts.
@@ -74,20 +85,26 @@ class World:
         Of the media, at the luminance-weighted mean of their absorption.
     notes : tuple of str
         What the user should know, one line each.
+    sizes : tuple of InWords
+        Of the media, in everybody's words.
     """
 
     scene: Scene
     level: str
+    leap: float
     place: Place
+    brim: Place
     packed: Packed
     media: Media
     tables: Tables
     memory: Memory
+    leaps: Leaps
     lights: LightArrays
     absorption: Absorption
     amounts: int
     parameters: tuple[VolumeParameters, ...]
     notes: tuple[str, ...]
+    sizes: tuple[InWords, ...]
 
 
 def camera_of(world: World) -> Camera:
@@ -201,7 +218,10 @@ def _triple(v: np.ndarray) -> tuple[float, float, float]:
     return float(v[0]), float(v[1]), float(v[2])
 
 
-def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
+def build(
+    scene: Scene, level: str, limit: int = MAX_EVENTS, leap: float | None = None,
+    progress: Callable[[float, str], None] | None = None,
+) -> World:  # fmt: skip
     """Return a scene ready to be rendered at a level.
 
     Parameters
@@ -209,7 +229,12 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
     scene : Scene
     level : str
     limit : int
-        Grains met after which a path is given up.
+        Grains met after which a path is given up; many more, if it is not given, where paths leap over most of them.
+    leap : float, optional
+        Radius of the smallest leap in transport mean free paths, 0 for none; else what the scene says, or `GAMMA`,
+        where the level leaps at all.
+    progress : callable, optional
+        Called with the share done and a word about it while records for leaps are made.
 
     Raises
     ------
@@ -218,7 +243,8 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
     """
     if level not in LEVELS:
         raise SceneError(f"{scene.name}: no level {level!r}; levels are {', '.join(LEVELS)}")
-    traits = LEVELS[level].traits
+    traits, singles = LEVELS[level].traits, singles_of(scene, level)
+    gamma = _gamma(scene, level, leap)
     read: dict[str, Table] = {}
 
     def table_of(spec: GrainSpec) -> Table:
@@ -230,7 +256,9 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
         return read[file]
 
     tables = [table_of(grain) for medium in scene.media for grain in medium.grains]
-    made = place(scene, grains=traits.placed)
+    made = brim = place(scene, grains=traits.placed or singles > 0)
+    if not traits.placed and singles and any(medium.inside == "centres" for medium in scene.media):
+        brim = place(scene)
     notes = list(made.notes)
     media, absorption, parameters = media_of(scene, traits, tables, limit)
     if records := LEVELS[level].records:
@@ -240,7 +268,7 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
                     f"{scene.name}: {grain.table} has no {records.name}, which level {level} draws from; "
                     f"build it with {records.option}"
                 )
-    memory = _memory(scene, tables if traits.remembers else [])
+    memory = _memory(scene, tables if traits.remembers or traits.answered else [], traits.remembers)
     for number, (medium, boundary) in enumerate(zip(scene.media, made.boundaries, strict=True), 1):
         extent = _extent(medium, boundary.vertices if boundary is not None else None)
         if 2.0 * medium.radius > extent and medium.inside == "grains":
@@ -248,43 +276,70 @@ def build(scene: Scene, level: str, limit: int = MAX_EVENTS) -> World:
                 f"{scene.name}: {called('medium', number, medium.name)}: a grain of diameter {2.0 * medium.radius:g} "
                 f"does not fit into the medium, which is {extent:.3g} thin"
             )
-    notes += _long_paths(scene, traits, tables, made, parameters, limit)
     lights, said = _lights(scene)
+    compiled = compile_tables(tables or [_no_table()], joint=traits.joint)
+    leaps, deep = leaping(scene, brim, media, compiled, memory, tables, gamma, bool(lights.sampled), progress)
+    met = _grains_met(scene, traits, tables, made, parameters, limit)
+    if any(deep) and limit == MAX_EVENTS:
+        longest = OUTLIVED * max(n for n, there in zip(met, deep, strict=True) if there)
+        media = media._replace(limit=int(min(max(limit, longest), MOST_EVENTS)))
+    notes += _long_paths(scene, [0.0 if there else n for n, there in zip(met, deep, strict=True)])
     notes += said
-    if traits.packed and scene.media and lights.sampled:
+    if singles and scene.media and lights.sampled:
         notes.append(
-            f"{scene.name}: level explicit meets suns and small bright lights by chance alone: until many samples "
-            "have, the picture is too dark and its variance does not tell; widen the sun or light by a smooth sky"
+            f"{scene.name}: {f'level {level} meets' if traits.packed else 'explicit grains meet'} suns and small "
+            "bright lights by chance alone: until many samples have, the picture is too dark and its variance does not "
+            "tell; widen the sun or light by a smooth sky"
         )
-    grains = packed(scene, tables) if traits.packed and scene.media else nothing_packed(len(scene.media), len(tables))
+    if singles and not traits.packed:
+        notes += hybrid_notes(scene, tables)
+    grains = nothing_packed(len(scene.media), len(tables))
+    if singles and scene.media:
+        grains = packed(scene, tables, traced=not traits.answered)
     return World(
         scene=scene,
         level=level,
+        leap=gamma if any(deep) else 0.0,
         place=made,
+        brim=brim,
         packed=grains,
-        media=media,
-        tables=compile_tables(tables or [_no_table()], joint=traits.joint),
+        media=media._replace(singles=singles),
+        tables=compiled,
         memory=memory,
+        leaps=leaps,
         lights=lights,
         absorption=absorption,
         amounts=len(absorption.least),
         parameters=parameters,
         notes=(*notes, *grains.notes),
+        sizes=tuple(_sizes(scene, tables)),
     )
 
 
-def _memory(scene: Scene, tables: list[Table]) -> Memory:
-    """Return what level teleport-memory remembers, of nothing where there are no tables."""
+def _sizes(scene: Scene, tables: list[Table]) -> Iterator[InWords]:
+    """Return size and amount of the grains of each medium."""
+    at = 0
+    for medium in scene.media:
+        grains = [(table, grain.fraction) for grain, table in zip(medium.grains, tables[at:], strict=False)]
+        at += len(grains)
+        sizes = grain_sizes(grains, dict(medium.sizes).get(MATERIAL_DENSITY))
+        yield InWords(sizes, medium.packing_fraction, medium.radius, scene.metres_per_unit)
+
+
+def _memory(scene: Scene, tables: list[Table], chained: bool) -> Memory:
+    """Return what tables remember of entries and, where light goes from sphere to sphere in a chain, packings of their
+    neighbours; of nothing where there are no tables."""
     if not tables:
         return memory_of([], [], [], [])
     laws, grains, at = [], [], 0
     for number, medium in enumerate(scene.media, 1):
         own = tables[at : at + len(medium.grains)]
         at += len(own)
-        try:
-            laws.append(law(medium.packing_fraction))
-        except TSDFError as error:
-            raise SceneError(f"{scene.name}: {called('medium', number, medium.name)}: {error}") from None
+        if chained:
+            try:
+                laws.append(law(medium.packing_fraction))
+            except TSDFError as error:
+                raise SceneError(f"{scene.name}: {called('medium', number, medium.name)}: {error}") from None
         grains.append([(table, grain.fraction) for grain, table in zip(medium.grains, own, strict=True)])
     fractions = [medium.packing_fraction for medium in scene.media]
     return memory_of(laws, fractions, [medium.radius for medium in scene.media], grains)
@@ -327,11 +382,22 @@ def mean_chord(medium: MediumSpec, boundary: Triangles | None) -> float:
     return 4.0 / 3.0 * shape.radius
 
 
-def _long_paths(
+def _gamma(scene: Scene, level: str, leap: float | None) -> float:
+    """Return the smallest radius of leaps in transport mean free paths; UsageError where it cannot be what is asked."""
+    can = LEVELS[level].traits.leaps
+    if leap is None:
+        named = scene.render.leap
+        return (GAMMA if named is None else checked(named)) if can else 0.0
+    if checked(leap) and not can:
+        raise UsageError(f"{scene.name}: level {level} cannot leap, for its grains have their places; leave out leap")
+    return leap
+
+
+def _grains_met(
     scene: Scene, traits: Traits, tables: list[Table], place: Place, parameters: Sequence[VolumeParameters], limit: int
-) -> list[str]:
-    """Return what is to be said of media in which paths meet very many grains; SceneError where they hardly end."""
-    notes, at = [], 0
+) -> list[float]:
+    """Return how many grains a path meets in each medium in the mean, about, until absorption or the limit ends it."""
+    found, at = [], 0
     camera = np.array(scene.camera.position) - place.centre
     for m, (medium, volume) in enumerate(zip(scene.media, parameters, strict=True)):
         own = list(zip(medium.grains, tables[at : at + len(medium.grains)], strict=True))
@@ -347,7 +413,14 @@ def _long_paths(
             / max(table.albedo(), DARKEST)
             for grain, table in own
         )
-        events = min(events, 1.0 / max(1.0 - kept, DARKEST), limit)  # absorption ends paths
+        found.append(min(events, 1.0 / max(1.0 - kept, DARKEST), limit if limit != MAX_EVENTS else math.inf))
+    return found
+
+
+def _long_paths(scene: Scene, met: Sequence[float]) -> list[str]:
+    """Return what is to be said of media in which paths meet very many grains; SceneError where they hardly end."""
+    notes = []
+    for m, (medium, events) in enumerate(zip(scene.media, met, strict=True)):
         title = called("medium", m + 1, medium.name)
         where = f"{scene.name}: {title}: light meets about {events:.1g} grains in the mean"
         if not events <= ENDLESS:
@@ -398,6 +471,8 @@ def _lights(scene: Scene) -> tuple[LightArrays, list[str]]:
             environment *= light.scale
             rotation = light.rotation_deg
             notes += [f"{scene.name}: {note}" for note in said]
+        else:
+            assert_never(light)
     try:
         return compile_lights(constant, environment, rotation, suns), notes
     except TSDFError as error:

@@ -11,7 +11,8 @@ class Traits(NamedTuple):
     jumps: bool = False  # it then leaves a grain elsewhere than it came, as if it jumped
     joint: bool = False  # such offsets are drawn as joint records of the table
     remembers: bool = False  # light goes from sphere to sphere of a packing, by the table's records by entry
-    packed: bool = False  # each grain has its place and is traced
+    packed: bool = False  # each grain has its place and is met there
+    answered: bool = False  # it is not traced but answered by the table's records by entry
     lobe: bool = False  # light is deflected as by one Henyey-Greenstein lobe
     similar: bool = False  # light is deflected anywhere, after free paths that much longer
 
@@ -19,6 +20,16 @@ class Traits(NamedTuple):
     def placed(self) -> bool:
         """Whether grains stand one by one, where there is room."""
         return self.remembers or self.packed
+
+    @property
+    def leaps(self) -> bool:
+        """Whether many events can be taken in one step: grains are drawn anew wherever light comes."""
+        return not self.packed
+
+    @property
+    def chains(self) -> bool:
+        """Whether light goes from grain to grain by a law, so that it can begin at any grain; see `walk.hybrid`."""
+        return self.jumps or self.remembers
 
     @property
     def points(self) -> bool:
@@ -47,11 +58,11 @@ class Level(NamedTuple):
     records: Records | None = None
 
 
+BY_ENTRY = Records("memory", "records by entry", "--memory 64")
 LEVELS = {
     "explicit": Level(Traits(spheres=True, packed=True), "#000000", "s"),
-    "teleport-memory": Level(
-        Traits(spheres=True, remembers=True), "#0072b2", records=Records("memory", "records by entry", "--memory 64")
-    ),
+    "teleport-packed": Level(Traits(spheres=True, packed=True, answered=True), "#999999", "P", BY_ENTRY),
+    "teleport-memory": Level(Traits(spheres=True, remembers=True), "#0072b2", records=BY_ENTRY),
     "teleport-joint": Level(
         Traits(spheres=True, tabulated=True, jumps=True, joint=True),
         "#009e73",

@@ -107,6 +107,13 @@ def free_path(components: Sequence[Component], packing_fraction: float) -> FreeP
     UsageError
         For an empty mixture, fractions that sum to 0, a packing fraction out of range, and one at which the mean
         advance in grains, if negative, outweighs the gaps.
+
+    Examples
+    --------
+    >>> import tsdf
+    >>> path = free_path([Component(tsdf.read("cube.tsdf.exr"), radius=0.001)], 0.5)
+    >>> f"{path.lambda_b:.6f} {path.hit_probability:.2f}"  # the gap between bounding spheres is 4/3 R at f = 1/2
+    '0.001333 0.64'
     """
     if not 0.0 < packing_fraction <= MAX_PACKING_FRACTION:
         raise UsageError(
@@ -165,6 +172,13 @@ def volume_parameters(
     ------
     UsageError
         As for `free_path`, and for an absorption that is negative, not finite or not one number per component.
+
+    Examples
+    --------
+    >>> import tsdf
+    >>> medium = volume_parameters([Component(tsdf.read("cube.tsdf.exr"), radius=0.001)], 0.5, absorption=[0.1])
+    >>> f"{medium.sigma_t:.0f} {medium.albedo:.5f} {medium.g:.3f}"
+    '247 0.99987 0.474'
     """
     path = free_path(components, packing_fraction)
     sigma_a = [0.0] * len(components) if absorption is None else [float(a) for a in absorption]

@@ -2,9 +2,10 @@
 
 `load` reads a file, `parse` takes the same as a dict. Everything that can be known to be wrong without opening the
 files a scene names is refused here, in one line that names the scene, the place and the way out; that they exist is
-checked, what is in them is not. Lengths are in scene units, right-handed axes, radiances in linear RGB. No geometry is
-built here, no light is followed, and absorption spectra of materials come from `materials`. Paths in a scene may point
-anywhere its reader may read.
+checked, what is in them is not, but for sizes, densities and colours in others' words (`sizes`, `deep`), which tables
+answer, and for the constants of a material. Lengths are in scene units, axes right-handed, radiances linear RGB. No
+geometry is built here, no light is followed, and absorption spectra of materials come from `materials`. Paths in a
+scene may point anywhere its reader may read.
 """
 
 import difflib
@@ -15,7 +16,7 @@ import reprlib
 import stat
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from itertools import pairwise
 from numbers import Integral, Real
 from pathlib import Path
@@ -24,11 +25,15 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tsdf.data import format
 from tsdf.data.table import Table
-from tsdf.errors import SceneError, UsageError
+from tsdf.errors import SceneError, TSDFError, UsageError
+from tsdf.grain import constants
 from tsdf.grain.materials import MEDIA, optical_constants
 from tsdf.scene import levels
+from tsdf.scene.deep import absorption_of_colour, check_colour
 from tsdf.scene.medium import MAX_PACKING_FRACTION
+from tsdf.scene.sizes import SIZES, WORDS, check_words, convert
 
 UP = ("z", "y")
 LEVELS = tuple(levels.LEVELS)
@@ -39,16 +44,18 @@ FARTHEST = 1e15  # [unit] of any coordinate: the ray engine's numbers are float3
 SMALLEST = 1e-12  # [unit] of anything that has a size
 MAX_BYTES = 1_000_000  # of the TOML text
 MAX_SIDE = 65536  # [pixel] along one side of the picture
-MAX_PIXELS = 2**25  # of the picture: two gigabytes while it is made
+MAX_PICTURE = 2**25  # of the picture: two gigabytes while it is made
 MAX_SAMPLES = 2**31 - 1  # per pixel
 MAX_GRAINS = 64  # kinds in all media together, each of which keeps a table in memory
 MAX_LIGHTS = 64
 MAX_MEDIA = 64
 MAX_SURFACES = 1000
 MAX_SPHERES = 100_000  # in a tile of the explicit level: a minute to pack
+MAX_EXPLICIT = 1_000_000  # grains met one by one before a chain takes over
 MAX_NAME = 200  # [characters]
 METRES_PER_NM = 1e-9
 ABSORBING = tuple(name for name, medium in MEDIA.items() if medium.k is not None)
+COLOURS = ("albedo", "deep_colour")  # two words for the colour of a deep medium in diffuse light
 
 Triple = tuple[float, float, float]
 
@@ -73,6 +80,8 @@ class Render:
     level: str = "teleport"  # one of LEVELS
     spp: int = 64  # samples per pixel
     seed: int = 0
+    leap: float | None = None  # smallest leap [transport mean free paths], 0 for none; None where it is not said
+    explicit_grains: int = 0  # met one by one, the first from the camera, before a chain of grains takes over
 
 
 @dataclass(frozen=True)
@@ -156,12 +165,14 @@ class Rectangle:
 
 @dataclass(frozen=True)
 class Absorption:
-    """The absorption coefficient of what a grain is made of: grey, rgb or spectral."""
+    """The absorption coefficient of what a grain is made of: grey, rgb or spectral; or the colour that it makes."""
 
-    kind: str  # "grey", "rgb" or "spectral"
+    kind: str  # "grey", "rgb" or "spectral"; "colour" only until `parse` has made it "rgb"
     coefficient: tuple[float, ...] = ()  # [1/unit]: one; red, green, blue; or one per wavelength. () with a material
     wavelength_nm: tuple[float, ...] = ()  # [nm], ascending; only where spectral and not of a material
-    material: str | None = None  # one of the absorbing `tsdf.grain.materials.MATERIALS`; only where spectral
+    material: str | Path | None = None  # an absorbing one of `tsdf.grain.materials`, or a file; only where spectral
+    colour: tuple[float, ...] = ()  # linear RGB of a deep medium of these grains, where this was asked for [1]
+    thickness: float = math.inf  # of the slab that has this colour [unit]
 
 
 @dataclass(frozen=True)
@@ -191,6 +202,7 @@ class MediumSpec:
     packing_seed: int = 0  # of the explicit level
     packing_spheres: int = 2000  # in the periodic tile of the explicit level
     inside: str = "grains"  # what lies inside the shape: bounding spheres wholly, or their centres; one of INSIDE
+    sizes: tuple[tuple[str, float], ...] = ()  # what was said in words of `sizes` that radius and packing_fraction obey
 
 
 @dataclass(frozen=True)
@@ -213,6 +225,7 @@ class Scene:
     render: Render = Render()
     metres_per_unit: float | None = None  # [m/unit]; given wherever a grain absorbs as a material does
     name: str = "scene"  # what messages call it
+    folder: str | None = field(default=None, compare=False)  # where its paths start; None if it was made in Python
 
 
 def load(path: str | os.PathLike[str]) -> Scene:
@@ -222,6 +235,13 @@ def load(path: str | os.PathLike[str]) -> Scene:
     ------
     SceneError
         In one line, for a file that cannot be read, is not TOML, or describes no scene.
+
+    Examples
+    --------
+    >>> import tsdf
+    >>> scene = tsdf.load_scene("heap.toml")
+    >>> scene.media[0].packing_fraction, scene.render.level
+    (0.5, 'teleport')
     """
     name = os.fspath(path)
     try:
@@ -261,8 +281,18 @@ def parse(data: Mapping[str, Any], folder: str | os.PathLike[str] = ".", name: s
     ------
     SceneError
         In one line, with the table, the key and the way out.
+
+    Examples
+    --------
+    >>> scene = parse({
+    ...     "camera": {"position": [0, -8, 1], "target": [0, 0, 1], "width": 160, "height": 120},
+    ...     "light": [{"type": "sun", "direction": [1, 0, 1], "irradiance": [3, 3, 3]}],
+    ...     "surface": [{"shape": {"type": "sphere", "centre": [0, 0, 1], "radius": 1}, "reflectance": 0.5}],
+    ... })
+    >>> scene.surfaces[0].shape
+    Sphere(centre=(0.0, 0.0, 1.0), radius=1.0)
     """
-    return replace(_SCENE(data, "the scene", _Place(name, "", Path(folder))), name=name)
+    return replace(_SCENE(data, "the scene", _Place(name, "", Path(folder))), name=name, folder=os.fspath(folder))
 
 
 def called(table: str, number: int, label: str) -> str:
@@ -306,19 +336,60 @@ def absorption_at(spec: Absorption, wavelengths_nm: ArrayLike, metres_per_unit: 
         For a wavelength out of range, a material without metres_per_unit, and for rgb, which has no wavelengths.
     """
     nm = np.atleast_1d(np.asarray(wavelengths_nm, dtype=np.float64))
-    if spec.kind == "rgb":
+    if spec.kind in ("rgb", "colour"):
         raise UsageError("absorption given as [r, g, b] has no spectrum; give a material, or wavelength_nm with it")
     if spec.kind == "grey":
         return np.full(len(nm), spec.coefficient[0])
     if spec.material is not None:
         if metres_per_unit is None:
             raise UsageError(f"absorption of {spec.material} is per metre: say metres_per_unit")
-        k = np.array([optical_constants(spec.material, w).k for w in nm.tolist()], dtype=np.float64)
+        k = _absorption_index(spec.material, nm)
         return 4.0 * math.pi * k / (nm * METRES_PER_NM) * metres_per_unit
     low, high = spec.wavelength_nm[0], spec.wavelength_nm[-1]
     if not ((nm >= low) & (nm <= high)).all():
         raise UsageError(f"the absorption spectrum is known from {low:g} to {high:g} nm only")
     return np.interp(nm, spec.wavelength_nm, spec.coefficient)
+
+
+def _absorption_index(material: str | Path, nm: np.ndarray) -> np.ndarray:
+    """Return k of a built-in material or of a file at wavelengths [nm], (n,) float64."""
+    if isinstance(material, str):
+        return np.array([optical_constants(material, w).k for w in nm.tolist()], dtype=np.float64)
+    medium, (low, high) = constants.read(material)
+    if medium.k is None or not ((nm >= low) & (nm <= high)).all():
+        raise UsageError(f"{material}: k is known from {low:g} to {high:g} nm only")
+    return np.array([medium.k(w) for w in nm.tolist()], dtype=np.float64)
+
+
+def absorbing_material(name: str, folder: str | os.PathLike[str] = ".") -> str | Path:
+    """Return an absorbing material: the name of a built-in one, or the path of a file of constants.
+
+    Parameters
+    ----------
+    name : str
+        As ``tsdf-build --material`` takes it.
+    folder : path
+        Where a relative path starts.
+
+    Raises
+    ------
+    UsageError, TSDFError
+        In one line, for what is neither, and for constants that do not say how light is absorbed from 380 to 780 nm.
+    """
+    path = Path(folder) / name
+    if name in ABSORBING:
+        return name
+    if name in MEDIA or not (Path(name).suffix or path.exists()):
+        named = f"it is one of {', '.join(ABSORBING)}." if name in MEDIA else _hint(name, ABSORBING)
+        raise UsageError(
+            f"no absorbing material {_shown(name)}; {named} A file of your own constants will do, too (.csv of "
+            "wavelength_nm,n,k or .yml of refractiveindex.info)"
+        )
+    medium, (low, high) = constants.read(path)
+    if medium.k is None or low > VISIBLE_NM[0] or high < VISIBLE_NM[1]:
+        known = "does not say k" if medium.k is None else f"says k from {low:g} to {high:g} nm only"
+        raise TSDFError(f"{path}: {known}; absorption needs it from {VISIBLE_NM[0]:g} to {VISIBLE_NM[1]:g} nm")
+    return path
 
 
 # --- readers: from what stands at a key to what it means ----------------------------
@@ -362,7 +433,8 @@ def _shown(value: Any) -> str:
 
 
 def _hint(word: str, valid: Sequence[str]) -> str:
-    near = difflib.get_close_matches(word[:MAX_NAME], valid, 1)
+    begun = [name for name in valid if len(word) >= 3 and name.startswith(word)]  # of "packing" the first named
+    near = begun or difflib.get_close_matches(word[:MAX_NAME], valid, 1)
     return f"did you mean {near[0]!r}?" if near else f"it is one of {', '.join(valid)}"
 
 
@@ -534,9 +606,22 @@ def _absorption(value: Any, key: str, at: _Place) -> Absorption:
     at = at.inside(key)
     if "material" in value:
         _check_keys(value, ("material",), at)
-        return Absorption("spectral", material=_choice(ABSORBING)(value["material"], "material", at))
+        name = _text(value["material"], "material", at)
+        try:
+            return Absorption("spectral", material=absorbing_material(name, at.folder))
+        except TSDFError as error:
+            at.fail(f"material: {error}")
+    if asked := [name for name in COLOURS if name in value]:
+        _check_keys(value, (asked[0], "thickness"), at)
+        thick = _number(above=0.0)(value["thickness"], "thickness", at) if "thickness" in value else math.inf
+        colour = _colour()(value[asked[0]], asked[0], at)
+        try:
+            check_colour(colour)
+        except UsageError as error:
+            at.fail(f"{asked[0]}: {error}")
+        return Absorption("colour", colour=colour, thickness=thick)
     names = ("wavelength_nm", "coefficient")
-    _check_keys(value, ("material", *names), at)
+    _check_keys(value, ("material", *COLOURS, *names), at)
     for name in names:
         if name not in value:
             at.fail(f"{name!r} is missing; a spectrum is wavelength_nm and coefficient, or else say the material")
@@ -550,6 +635,70 @@ def _absorption(value: Any, key: str, at: _Place) -> Absorption:
         covered = f"not only {nm[0]:g} to {nm[-1]:g}" if nm else "not nothing"
         at.fail(f"wavelength_nm must cover {low:g} to {high:g} nm, {covered}")
     return Absorption("spectral", sigma_a, nm)
+
+
+def _grain(table: Reader, keys: Sequence[str]) -> Reader:
+    """Read a kind of grain, whose colour may stand in the place of its absorption."""
+
+    def read(value: Any, key: str, at: _Place) -> GrainSpec:
+        _check_keys(value, (*keys, *COLOURS), at)
+        asked = [name for name in COLOURS if name in value]
+        if len(asked) + (bool(asked) and "absorption" in value) > 1:
+            at.fail(f"{asked[0]} and {[*asked, 'absorption'][1]} both say how grains absorb; give one")
+        if asked:
+            value = {name: item for name, item in value.items() if name not in asked} | {
+                "absorption": {asked[0]: value[asked[0]]}
+            }
+        made: GrainSpec = table(value, key, at)
+        return made
+
+    return read
+
+
+def _medium(table: Reader, keys: Sequence[str]) -> Reader:
+    """Read a medium, whose radius and packing fraction may be said in words of `sizes`; `_in_numbers` finds them."""
+
+    def read(value: Any, key: str, at: _Place) -> MediumSpec:
+        _check_keys(value, (*keys, *WORDS), at)
+        if not any(name in value for name in WORDS if name not in keys):
+            plain: MediumSpec = table(value, key, at)
+            return plain
+        words = {name: _POSITIVE(value[name], name, at) for name in WORDS if name in value}
+        try:
+            check_words(words)
+        except UsageError as error:
+            at.fail(str(error))
+        if not any(name in SIZES for name in words):
+            at.fail(f"how large grains are is missing; give one of {', '.join(SIZES)}")
+        rest = {name: item for name, item in value.items() if name not in WORDS or name in keys}
+        made: MediumSpec = table({"radius": 1.0, "packing_fraction": 0.5} | rest, key, at)
+        return replace(made, sizes=tuple(words.items()))
+
+    return read
+
+
+def _in_numbers(medium: MediumSpec, metres_per_unit: float | None, at: _Place) -> MediumSpec:
+    """Return a medium whose sizes and colours are numbers of ours, by the tables it names."""
+    coloured = [grain.absorption.kind == "colour" for grain in medium.grains]
+    if not medium.sizes and not any(coloured):
+        return medium
+    try:
+        tables = [g.table if isinstance(g.table, Table) else format.read(g.table) for g in medium.grains]
+        if medium.sizes:
+            shares = [(table, grain.fraction) for table, grain in zip(tables, medium.grains, strict=True)]
+            packed = convert(shares, dict(medium.sizes), metres_per_unit)
+            medium = replace(medium, radius=packed.radius, packing_fraction=packed.fraction)
+        grains = []
+        for grain, table, ask in zip(medium.grains, tables, coloured, strict=True):
+            if ask:
+                of, thick = grain.absorption.colour, grain.absorption.thickness / medium.radius
+                found = absorption_of_colour(table, of, thick, medium.packing_fraction)
+                coefficient = tuple(x / medium.radius for x in found)
+                grain = replace(grain, absorption=replace(grain.absorption, kind="rgb", coefficient=coefficient))
+            grains.append(grain)
+    except TSDFError as error:
+        at.fail(str(error))
+    return replace(medium, grains=tuple(grains))
 
 
 # --- what must hold between the values of one table ---------------------------------
@@ -582,8 +731,8 @@ def _check_camera(camera: Camera, at: _Place) -> Camera:
         at.fail("up has no length; say up = [0, 0, 1]")
     if _parallel(view, up):
         at.fail("up is parallel to the view from position to target; turn it, say up = [0, 1, 0]")
-    if camera.width * camera.height > MAX_PIXELS:
-        at.fail(f"a picture of {camera.width} x {camera.height} has more than {MAX_PIXELS} pixels; make it smaller")
+    if camera.width * camera.height > MAX_PICTURE:
+        at.fail(f"a picture of {camera.width} x {camera.height} has more than {MAX_PICTURE} pixels; make it smaller")
     return camera
 
 
@@ -598,8 +747,8 @@ def resized(scene: Scene, width: int | None) -> Scene:
     if width is None:
         return scene
     height = max(1, round(scene.camera.height * width / scene.camera.width))
-    if width < 1 or width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
-        raise UsageError(f"a width of {width} is out of range: at least 1, at most {MAX_PIXELS} pixels in all")
+    if width < 1 or width * height > MAX_PICTURE or max(width, height) > MAX_SIDE:
+        raise UsageError(f"a width of {width} is out of range: at least 1, at most {MAX_PICTURE} pixels in all")
     return replace(scene, camera=replace(scene.camera, width=width, height=height))
 
 
@@ -650,7 +799,9 @@ def _check_scene(scene: Scene, at: _Place) -> Scene:
     materials = [grain.absorption.material for medium in scene.media for grain in medium.grains]
     if scene.metres_per_unit is None and any(materials):
         at.fail("metres_per_unit is missing: absorption of a material is per metre; say metres_per_unit = 1.0")
-    return scene
+    places = [at.inside(called("medium", i, medium.name)) for i, medium in enumerate(scene.media, 1)]
+    media = (_in_numbers(m, scene.metres_per_unit, place) for m, place in zip(scene.media, places, strict=True))
+    return replace(scene, media=tuple(media))
 
 
 # --- the keys of each table ---------------------------------------------------------
@@ -673,25 +824,43 @@ _LIGHT = _tagged(
         angular_diameter_deg=_number(above=0.0, high=180.0, why="0 would make a zero-area light"),
     ),
 )
-_GRAIN = _table(GrainSpec, table=_file, fraction=_NOT_NEGATIVE, mesh=_file, absorption=_absorption)
-_MEDIUM = _table(
-    MediumSpec,
-    _check_medium,
-    name=_name,
-    shape=_section(_tagged(mesh=_MESH, box=_BOX, sphere=_SPHERE, slab=_SLAB)),
-    packing_fraction=_number(above=0.0, high=MAX_PACKING_FRACTION, why="equal spheres fill at most 0.7405"),
-    radius=_POSITIVE,
-    inside=_choice(INSIDE),
-    packing_seed=_integer(),
-    packing_spheres=_integer(1, MAX_SPHERES),
-    grain=_tables("[[medium.grain]]", _GRAIN, MAX_GRAINS, 1),
-)
+_GRAIN_KEYS: dict[str, Reader] = {
+    "table": _file, "fraction": _NOT_NEGATIVE, "mesh": _file, "absorption": _absorption,
+}  # fmt: skip
+_GRAIN = _grain(_table(GrainSpec, **_GRAIN_KEYS), tuple(_GRAIN_KEYS))
+_MEDIUM_KEYS: dict[str, Reader] = {
+    "name": _name,
+    "shape": _section(_tagged(mesh=_MESH, box=_BOX, sphere=_SPHERE, slab=_SLAB)),
+    "packing_fraction": _number(above=0.0, high=MAX_PACKING_FRACTION, why="equal spheres fill at most 0.7405"),
+    "radius": _POSITIVE,
+    "inside": _choice(INSIDE),
+    "packing_seed": _integer(),
+    "packing_spheres": _integer(1, MAX_SPHERES),
+    "grain": _tables("[[medium.grain]]", _GRAIN, MAX_GRAINS, 1),
+}
+_MEDIUM = _medium(_table(MediumSpec, _check_medium, **_MEDIUM_KEYS), tuple(_MEDIUM_KEYS))
 _SURFACE = _table(
     SurfaceSpec,
     name=_name,
     shape=_section(_tagged(rectangle=_RECTANGLE, mesh=_MESH, box=_BOX, sphere=_SPHERE)),
     reflectance=_colour(1.0),
 )
+
+
+def _leap(value: Any, key: str, at: _Place) -> float:
+    """Read the smallest radius of leaps: 0 for none, else 1 or more."""
+    leap: float = _number(0.0)(value, key, at)
+    if 0.0 < leap < 1.0:
+        at.fail(f"{key} must be 0 (none) or at least 1, not {leap:g}; leaps that short are biased")
+    return leap
+
+
+def _check_render(render: Render, at: _Place) -> Render:
+    if render.leap and not levels.LEVELS[render.level].traits.leaps:
+        at.fail(f"level {render.level} cannot leap, for its grains have their places; leave out leap, or say 0")
+    return render
+
+
 _CAMERA = _table(
     Camera,
     _check_camera,
@@ -708,7 +877,17 @@ _SCENE = _table(
     _check_scene,
     metres_per_unit=_POSITIVE,
     camera=_section(_CAMERA),
-    render=_section(_table(Render, level=_choice(LEVELS), spp=_integer(1, MAX_SAMPLES), seed=_integer())),
+    render=_section(
+        _table(
+            Render,
+            _check_render,
+            level=_choice(LEVELS),
+            spp=_integer(1, MAX_SAMPLES),
+            seed=_integer(),
+            leap=_leap,
+            explicit_grains=_integer(0, MAX_EXPLICIT),
+        )
+    ),
     light=_tables("[[light]]", _LIGHT, MAX_LIGHTS),
     medium=_tables("[[medium]]", _MEDIUM, MAX_MEDIA),
     surface=_tables("[[surface]]", _SURFACE, MAX_SURFACES),

@@ -72,14 +72,14 @@ class GrainSizes:
 
 
 @dataclass(frozen=True)
-class Packed:
+class InWords:
     """Packed grains in our words, radius and packing fraction, and in the others'.
 
     Attributes
     ----------
     sizes : GrainSizes
-    packing_fraction : float
-        Share of space in bounding spheres [1].
+    packing_fraction : float or None
+        Share of space in bounding spheres [1]; None where only a size was said.
     radius : float
         Bounding radius R [unit].
     metres_per_unit : float or None
@@ -87,20 +87,20 @@ class Packed:
     """
 
     sizes: GrainSizes
-    packing_fraction: float
+    packing_fraction: float | None
     radius: float
     metres_per_unit: float | None = None
 
     @property
-    def solid_fraction(self) -> float:
+    def solid_fraction(self) -> float | None:
         """Share of space in the grains' material [1]."""
-        return self.packing_fraction * self.sizes.solid_share
+        return None if self.packing_fraction is None else self.packing_fraction * self.sizes.solid_share
 
     @property
     def density(self) -> float | None:
         """Mass over volume [kg/m^3]; None where the material's is unknown."""
-        solid = self.sizes.material_density
-        return None if solid is None else solid * self.solid_fraction
+        solid, share = self.sizes.material_density, self.solid_fraction
+        return None if solid is None or share is None else solid * share
 
     @property
     def ssa(self) -> float | None:
@@ -133,6 +133,12 @@ class Packed:
         told = [f"{name} {value}{units.get(name, '')}" for name, value in said.items()]
         ours = [w for w in told if w.split()[0] in ("radius", "packing_fraction")]
         return f"{', '.join(ours)} = {', '.join(w for w in told if w not in ours)}"
+
+    @property
+    def fraction(self) -> float:
+        """The packing fraction, where one was said [1]."""
+        assert self.packing_fraction is not None
+        return self.packing_fraction
 
 
 def grain_sizes(grains: Sequence[tuple[Table, float]], material_density: float | None = None) -> GrainSizes:
@@ -184,8 +190,11 @@ def grain_sizes(grains: Sequence[tuple[Table, float]], material_density: float |
 
 
 def convert(
-    grains: Sequence[tuple[Table, float]], said: Mapping[str, float], metres_per_unit: float | None = None
-) -> Packed:
+    grains: Sequence[tuple[Table, float]],
+    said: Mapping[str, float],
+    metres_per_unit: float | None = None,
+    amount_needed: bool = True,
+) -> InWords:
     """Return bounding radius and packing fraction of grains of which somebody says size and amount in any words.
 
     Parameters
@@ -197,6 +206,8 @@ def convert(
         needed and the table names no material; numbers > 0.
     metres_per_unit : float, optional
         Length of the scene unit [m]; only ssa needs it.
+    amount_needed : bool
+        Whether one of `AMOUNTS` must be there.
 
     Raises
     ------
@@ -205,18 +216,20 @@ def convert(
         solid fractions and densities of which the bounding spheres could not be packed (`DENSEST_RANDOM`), with
         the nearest that can.
     """
-    check_words(said)
+    check_words(said, amount_needed)
     sizes = grain_sizes(grains, said.get(MATERIAL_DENSITY))
     size = next((word for word in SIZES if word in said), None)
     radius = 1.0 if size is None else _radius(sizes, size, said[size], metres_per_unit)
-    if not 1e-30 <= radius <= 1e30:
-        raise UsageError(f"{size} {said[size or '']:g} makes a bounding radius of {radius:g} units: out of range")
-    amount = next(word for word in AMOUNTS if word in said)
+    if size not in (None, "radius") and not 1e-30 <= radius <= 1e30:
+        raise UsageError(f"{size} {said[str(size)]:g} makes a bounding radius of {radius:g} units: out of range")
+    amount = next((word for word in AMOUNTS if word in said), None)
+    if amount is None:
+        return InWords(sizes, None, radius, metres_per_unit)
     fraction = said[amount]
     if amount == "packing_fraction":
         if not fraction <= MAX_PACKING_FRACTION:
-            raise UsageError(f"packing_fraction must be at most {MAX_PACKING_FRACTION:g}, not {fraction:g}")
-        return Packed(sizes, fraction, radius, metres_per_unit)
+            raise UsageError(f"the packing fraction must be at most {MAX_PACKING_FRACTION:g}, not {fraction:g}")
+        return InWords(sizes, fraction, radius, metres_per_unit)
     solid = fraction
     if amount == "density":
         solid = fraction / _known_density(sizes, amount)
@@ -229,10 +242,10 @@ def convert(
         raise UsageError(f"solid_fraction is a share of space, at most 1, not {solid:g}")
     if solid / sizes.solid_share > DENSEST_RANDOM:
         raise UsageError(_too_dense(grains, sizes, amount, fraction, solid / sizes.solid_share))
-    return Packed(sizes, solid / sizes.solid_share, radius, metres_per_unit)
+    return InWords(sizes, solid / sizes.solid_share, radius, metres_per_unit)
 
 
-def check_words(said: Mapping[str, float]) -> None:
+def check_words(said: Mapping[str, float], amount_needed: bool = True) -> None:
     """Refuse what no table could make sense of: two words of a kind, no amount, numbers that are not > 0.
 
     Raises
@@ -249,7 +262,7 @@ def check_words(said: Mapping[str, float]) -> None:
         given = [word for word in words if word in said]
         if len(given) > 1:
             raise UsageError(f"{' and '.join(given)} each say the {kind} of grains: give one")
-    if not any(word in said for word in AMOUNTS):
+    if amount_needed and not any(word in said for word in AMOUNTS):
         raise UsageError(f"how much of space is filled is missing: give one of {', '.join(AMOUNTS)}")
 
 
@@ -286,7 +299,7 @@ def _too_dense(
 
     Mean free paths fall as 1/density: a void and a grain together are V / (A solid_fraction) long in the mean.
     """
-    most = Packed(sizes, DENSEST_RANDOM, 1.0)
+    most = InWords(sizes, DENSEST_RANDOM, 1.0)
     densest = most.solid_fraction if amount == "solid_fraction" else most.density
     path = volume_parameters([Component(table, share) for table, share in grains], DENSEST_RANDOM)
     longer = wanted / DENSEST_RANDOM

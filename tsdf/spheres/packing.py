@@ -327,7 +327,8 @@ def _compressed(fraction: float, spheres: int, key: np.uint64, side: float) -> n
 # ------------------------------------------------------------------------------------------ keeping
 
 
-def _folder() -> Path:
+def cache_folder() -> Path:
+    """Return the folder for what is kept between runs: `pack` says where it is."""
     own = os.environ.get("TSDF_CACHE")
     if own:
         return Path(own)
@@ -341,7 +342,7 @@ def _cached(name: str, spheres: int, side: float) -> np.ndarray | None:
     The name says fraction, number and seed, and stands in the file under one digest with the centres.
     """
     try:
-        kept = archive.read(_folder() / f"{name}.npz", limit=24 * spheres + 8192)
+        kept = archive.read(cache_folder() / f"{name}.npz", limit=24 * spheres + 8192)
         centres, label = kept["centres"], str(kept["name"])
     except (OSError, ValueError, KeyError):  # not there or damaged: it is made
         return None
@@ -353,7 +354,7 @@ def _cached(name: str, spheres: int, side: float) -> np.ndarray | None:
 
 def _keep(name: str, centres: np.ndarray) -> None:
     try:
-        folder = _folder()
+        folder = cache_folder()
         folder.mkdir(parents=True, exist_ok=True)
         archive.write(folder / f"{name}.npz", {"centres": centres, "name": np.array(name)})
     except (OSError, TSDFError):  # the packing is made again next time

@@ -42,7 +42,7 @@ from tsdf.study.experiment import follow as follow
 from tsdf.study.experiment import slab as slab
 from tsdf.walk.explicit import exemplar
 
-MEASURED = ("explicit", "teleport-memory", "teleport-joint", "teleport", "volume")
+MEASURED = ("explicit", "teleport-packed", "teleport-memory", "teleport-joint", "teleport", "volume")
 FRACTIONS = (0.1, 0.3, 0.5, 0.6, 0.64)
 LAYERS = (2.0, 4.0, 10.0, 40.0)  # [R]
 ANGLES = (0.0, 60.0)  # [degrees]
@@ -81,8 +81,8 @@ class Row:
     value, error : float
         And its standard error; of a profile, what counting alone would give on average.
     paths_error, packings_error : float
-        Of explicit, what the error owes to counting and what to the places of the grains; 0 where that cannot be
-        told from counting. The error is not less than the spread over packings says. Else nan.
+        Of levels of packed grains, what the error owes to counting and what to the places of the grains; 0 where that
+        cannot be told from counting. The error is not less than the spread over packings says. Else nan.
     deviation, deviation_error : float
         From explicit, over it, with both errors [1]; nan where there is none.
     """
@@ -114,7 +114,7 @@ class Accuracy:
     fraction : float
         Whose slabs and times charts show: that nearest to 0.6.
     packings, block : int
-        Behind explicit; events of a block in the bulk.
+        Behind levels of packed grains; events of a block in the bulk.
     rows : tuple of Row
     notes : tuple of str
         What was skipped, one line each.
@@ -323,14 +323,15 @@ class _Run:
         bulk = math.isnan(case.layer)
         most = 1.0 - TIMED if bulks == cases else BULK
         share = most / bulks if bulk else (1.0 - BULK - TIMED) / (cases - bulks)
-        share /= len(self.levels) - 1 + self.packings
+        share /= sum(self.packings if L.LEVELS[level].traits.packed else 1 for level in self.levels)
         found: dict[str, _Found] = {}
         word = f"packing fraction {case.fraction:g}, "
         word += "bulk" if bulk else f"layer of {case.layer:g} R at {case.angle_deg:g} degrees"
         tops = [0.0] if bulk else cuts(case.fraction, case.layer)
         for level in self.levels:
-            runs = [(k, top) for top in tops for k in range(self.packings)] if level == "explicit" else [(0, 0.0)]
-            own = share * (self.packings if level == "explicit" else 1) / len(runs)
+            several = L.LEVELS[level].traits.packed
+            runs = [(k, top) for top in tops for k in range(self.packings)] if several else [(0, 0.0)]
+            own = share * (self.packings if several else 1) / len(runs)
             sums = []
             for k, (packing, top) in enumerate(runs):
                 self.told(own, f"{word}, {level}" + (f" {k + 1} of {len(runs)}" if len(runs) > 1 else ""))
@@ -405,8 +406,14 @@ class _Run:
 def _beside(runs: Sequence[Sums]) -> Sums:
     """Return the numbers of runs one after the other, as if of two paths each, and with their errors."""
     mean, error = np.concatenate([one.mean for one in runs]), np.concatenate([one.error for one in runs])
-    events, seconds = sum(one.events for one in runs), sum(one.seconds for one in runs)
-    return Sums(2, 2.0 * mean, 2.0 * (mean**2 + error**2), events, seconds)
+    return Sums(
+        paths=2,
+        total=2.0 * mean,
+        squares=2.0 * (mean**2 + error**2),
+        events=sum(one.events for one in runs),
+        drawn=sum(one.drawn for one in runs),
+        seconds=sum(one.seconds for one in runs),
+    )
 
 
 def _packed(sums: Sequence[Sums]) -> _Found:

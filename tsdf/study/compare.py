@@ -19,6 +19,7 @@ from tsdf.errors import TSDFError, UsageError
 from tsdf.picture import render
 from tsdf.picture.render import Picture
 from tsdf.picture.world import World, build
+from tsdf.scene.levels import LEVELS as MODELS
 from tsdf.scene.scene import LEVELS, Scene
 
 REFERENCES = LEVELS  # best first
@@ -275,6 +276,8 @@ def compare(
             raise UsageError(f"samples and seconds are finite numbers above 0, not {value}")
 
     notes: list[str] = []
+    if singles := scene.render.explicit_grains:
+        notes.append(f"the levels that go from grain to grain follow the first {singles} grains as level explicit does")
     level, world = _reference(scene, notes)
     better = REFERENCES[: REFERENCES.index(level)]  # impossible, and noted
     others = [name for name in LEVELS if name in levels and name not in (level, *better)]
@@ -335,7 +338,7 @@ class _Series:
         self.world = world
         for k in range(packings):
             if k and self.level == "explicit" and self.scene.media:
-                self.world = build(_repacked(self.scene, k), self.level)
+                self.world = build(_taken(_repacked(self.scene, k), self.level), self.level)
             time = seconds and seconds / packings
             what = f"{self.level}, picture {k + 1} of {packings}"
             picture = self._shot(self.world, k, what, None if time else spp, time)
@@ -366,7 +369,7 @@ class _Series:
     def judge(self, name: str, spp: int | None, seconds: float | None) -> None:
         """Add the row of another level, or why there is none."""
         try:
-            world = build(self.scene, name)
+            world = build(_taken(self.scene, name), name)
         except TSDFError as error:
             self.notes.append(f"{name} is skipped: {error}")
             self.begun += 1
@@ -431,7 +434,7 @@ def _reference(scene: Scene, notes: list[str]) -> tuple[str, World]:
     first: list[str] = []
     for level in REFERENCES:
         try:
-            world = build(scene, level)
+            world = build(_taken(scene, level), level)
         except TSDFError as error:
             failed = failed or error
             first.append(f"{level} cannot be the reference: {error}")
@@ -440,6 +443,13 @@ def _reference(scene: Scene, notes: list[str]) -> tuple[str, World]:
         return level, world
     assert failed is not None
     raise failed
+
+
+def _taken(scene: Scene, level: str) -> Scene:
+    """Return a scene without the explicit grains that a level cannot take."""
+    if MODELS[level].traits.chains:
+        return scene
+    return replace(scene, render=replace(scene.render, explicit_grains=0))
 
 
 def _repacked(scene: Scene, k: int) -> Scene:

@@ -17,7 +17,8 @@ import numpy as np
 from tsdf.data.table import Table
 from tsdf.picture.render import SLOTS, Walkers
 from tsdf.picture.world import World, beam, build
-from tsdf.scene.scene import Absorption, Camera, ConstantLight, GrainSpec, MediumSpec, Scene, Slab, Sphere
+from tsdf.scene.scene import Absorption, Camera, ConstantLight, GrainSpec, MediumSpec, Render, Scene, Slab, Sphere
+from tsdf.spheres.around import around_of
 from tsdf.spheres.packing import cells_of, pack
 from tsdf.walk import transport as T
 from tsdf.walk import walker as W
@@ -49,8 +50,8 @@ class Ends(NamedTuple):
         What roulette makes of it; throughput but for absorption, 0 if it did not come out.
     amounts : (n, a) float64
         Of matter crossed, see `walker.Absorption`.
-    events : int
-        Grains met, by all.
+    events, drawn : int
+        Grains met, by all; and what was drawn for that, single events and leaps.
     seconds : float
         Processor time spent on it, by all threads together.
     """
@@ -61,6 +62,7 @@ class Ends(NamedTuple):
     weight: np.ndarray
     amounts: np.ndarray
     events: int
+    drawn: int
     seconds: float
 
 
@@ -94,9 +96,9 @@ def trips(
     world: World, camera: T.Camera, first: int, paths: int, seed: int,
     heard: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
     aim: Callable[[np.ndarray], None] = lambda new: None,
-) -> tuple[int, float]:  # fmt: skip
+) -> tuple[int, int, float]:  # fmt: skip
     """Follow paths of a camera's first pixel, and tell of each whenever it has met as many grains as the world's limit
-    says, and when it ends; return grains met and processor time [s].
+    says, and when it ends; return grains met, what was drawn for that (single events and leaps), processor time [s].
 
     Parameters
     ----------
@@ -131,7 +133,8 @@ def trips(
             mine.walkers[0][live : live + more] = those[again]
             mine.amounts[0][live : live + more] = mine.amounts[1][gone][again]
             live += more
-    return int(mine.counters[W.EVENTS]), time.thread_time() - began
+    events, seconds = int(mine.counters[W.EVENTS]), time.thread_time() - began
+    return events, events - int(mine.counters[W.LEAPT]) + int(mine.counters[W.LEAPS]), seconds
 
 
 def _batch(world: World, camera: T.Camera, first: int, paths: int, seed: int, marks: int) -> tuple[np.ndarray, Ends]:
@@ -151,8 +154,8 @@ def _batch(world: World, camera: T.Camera, first: int, paths: int, seed: int, ma
         passed[number] += 1
         return able & (passed[number] < marks)
 
-    events, seconds = trips(world, camera, first, paths, seed, heard, begin)
-    return places, Ends(start, place, way, weight, amounts, events, seconds)
+    events, drawn, seconds = trips(world, camera, first, paths, seed, heard, begin)
+    return places, Ends(start, place, way, weight, amounts, events, drawn, seconds)
 
 
 def follow(
@@ -187,8 +190,10 @@ def follow(
         pool.shutdown(cancel_futures=True)
     ends = [one for _, one in found]
     start, place, way, weight, amounts = (np.concatenate([one[k] for one in ends]) for k in range(5))
-    events, taken = sum(one.events for one in ends), sum(one.seconds for one in ends)
-    return np.concatenate([places for places, _ in found]), Ends(start, place, way, weight, amounts, events, taken)
+    events, drawn = sum(one.events for one in ends), sum(one.drawn for one in ends)
+    return np.concatenate([places for places, _ in found]), Ends(
+        start, place, way, weight, amounts, events, drawn, sum(one.seconds for one in ends)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,6 +214,7 @@ class Sums:
     total: np.ndarray | float = 0.0
     squares: np.ndarray | float = 0.0
     events: int = 0
+    drawn: int = 0
     seconds: float = 0.0
     lost: int = 0
 
@@ -218,7 +224,8 @@ class Sums:
         values = values[there]
         self.paths += len(values)
         self.total, self.squares = self.total + values.sum(axis=0), self.squares + (values**2).sum(axis=0)
-        self.events, self.seconds = self.events + ends.events, self.seconds + ends.seconds
+        self.events, self.drawn = self.events + ends.events, self.drawn + ends.drawn
+        self.seconds += ends.seconds
 
     @property
     def mean(self) -> np.ndarray:
@@ -290,7 +297,7 @@ def bulk_experiment(
     level: str, grain: GrainSpec, fraction: float, packing: int = 0, block: int = BLOCK, blocks: int = BLOCKS
 ) -> Experiment:
     """Return what `diffusion` measures."""
-    world = build(scene_of(Sphere((0.0, 0.0, 0.0), FAR), grain, fraction, packing), level, limit=block)
+    world = build(scene_of(Sphere((0.0, 0.0, 0.0), FAR), grain, fraction, packing), level, limit=block, leap=0.0)
 
     def read(places: np.ndarray, ends: Ends) -> np.ndarray:
         steps = np.diff(places, axis=1)
@@ -329,21 +336,24 @@ def _lower(world: World, fraction: float, packing: int, height: float) -> None:
     """Move the spheres of a packed world down, all the same."""
     made = pack(fraction, SPHERES, packing)
     moved = replace(made, centres=(made.centres - (0.0, 0.0, height)) % made.side)
-    arrays = world.packed.arrays
-    world.packed.arrays = arrays._replace(cells=(cells_of(moved),), centres=(np.ascontiguousarray(moved.centres),))
+    around = around_of(moved if world.media.traits.answered else None)
+    world.packed.arrays = world.packed.arrays._replace(
+        cells=(cells_of(moved),), centres=(np.ascontiguousarray(moved.centres),), around=(around,)
+    )
 
 
 def slab_experiment(
     level: str, grain: GrainSpec, fraction: float, layer: float, cosine: float = 1.0, packing: int = 0,
-    coefficients: Sequence[float] | None = None, top: float = 0.0,
+    coefficients: Sequence[float] | None = None, top: float = 0.0, leap: float = 0.0, singles: int = 0,
 ) -> Experiment:  # fmt: skip
     """Return what `slab` measures: reflectance, transmittance and profile one after the other, and so again for each of
     several absorption coefficients [1/R] if they are given, of the very same paths. The layer's
-    upper end is at height `top` of the tile."""
+    upper end is at height `top` of the tile; the first `singles` grains are met one by one."""
     if coefficients is not None:
         grain = replace(grain, absorption=Absorption("grey", (FAINTEST,)))
-    world = build(scene_of(Slab(-layer, 0.0), grain, fraction, packing), level)
-    if level == "explicit":
+    scene = replace(scene_of(Slab(-layer, 0.0), grain, fraction, packing), render=Render(explicit_grains=singles))
+    world = build(scene, level, leap=leap)
+    if world.media.singles:
         _lower(world, fraction, packing, top)
     way = np.array([math.sqrt(1.0 - cosine**2), 0.0, -cosine])
     high = 5.0 + WIDE  # the beam's tilted square begins above the slab

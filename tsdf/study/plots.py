@@ -16,7 +16,8 @@ from tsdf.data.table import Table
 from tsdf.errors import UsageError
 from tsdf.files import replacing
 from tsdf.judge import analytic
-from tsdf.judge.validate import ROUNDING, ZHOU_ETA, reference
+from tsdf.judge.court import ROUNDING
+from tsdf.judge.physics import ZHOU_ETA, reference
 from tsdf.scene.levels import LEVELS
 
 SUFFIXES = (".png", ".pdf")

@@ -337,7 +337,7 @@ class Paths:
                     np.add.at(light[:, s], group[number[end]][side == s], left[side == s])
             return able
 
-        _, seconds = trips(world, self.camera(), begin, count, seed, heard, aim)
+        _, _, seconds = trips(world, self.camera(), begin, count, seed, heard, aim)
         return light, layers, np.bincount(group, minlength=GROUPS), seconds
 
     def more(self, paths: int, seed: int, pool: ThreadPoolExecutor) -> Iterator[float]:

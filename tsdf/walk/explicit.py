@@ -9,6 +9,7 @@ all other grains share one ray-engine scene for each exemplar.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,11 +17,12 @@ import numpy as np
 from tsdf.compiled import njit
 from tsdf.data.table import Table
 from tsdf.errors import SceneError, TSDFError
-from tsdf.grain.grains import Grain, embree_scene, grain_from_mesh, load_grain
+from tsdf.grain.grains import BUILT_INS, Grain, embree_scene, grain_from_mesh, load_grain
 from tsdf.grain.meshes import read_mesh
 from tsdf.grain.optics import OFFSET, UNPOLARISED, P, S, fresnel, nearer, on_plane, parted, sound
 from tsdf.sampling import GOLDEN, key_of, mix, turn, unit
 from tsdf.scene.scene import GrainSpec, Scene, called
+from tsdf.spheres.around import Around, around_of
 from tsdf.spheres.packing import Cells, cells_of, next_sphere, pack
 from tsdf.vectors import KERNEL, dot, renewed, step, triple
 from tsdf.walk.geometry import planes_of
@@ -32,15 +34,17 @@ ENTERED, INSIDE, RETRIED, LEFT = 0, 1, 2, 4
 
 
 class Grains(NamedTuple):
-    """What kernels ask about packed grains. The first two are tuples over media, the rest arrays.
+    """What kernels ask about packed grains. The first three are tuples over media, the rest arrays.
 
-    cells, centres: the tile's grid and its (n, 3) centres [R]; radius (m,): R [unit]; seed (m,) uint64. Of components:
+    cells, centres, around: the tile's grid, its (n, 3) centres [R], and for grains that are not traced the spheres
+    around each; radius (m,): R [unit]; seed (m,) uint64. Of components:
     share (c,): running sum of number fractions in each medium; eta, kept_apart (c,) (the polarisations), exemplar (c,)
     int32: ray-engine scene. Of the exemplars' facets: planes (f, 4), centroids (f, 3), first_facet (e,).
     """
 
     cells: tuple[Cells, ...]
     centres: tuple[np.ndarray, ...]
+    around: tuple[Around, ...]
     radius: np.ndarray
     seed: np.ndarray
     share: np.ndarray
@@ -67,6 +71,13 @@ def centre_of(grains, m, i, j, k, sphere):
 
 
 @njit(**KERNEL)
+def named(grains, m, i, j, k, sphere):
+    """Return the key of the grain in a sphere of tile (i, j, k) of medium m, of which it is a function."""
+    tile = key_of(grains.seed[m], (i + 1048576) * 2097152 + (j + 1048576), k + 1048576)
+    return mix(tile + np.uint64(sphere))
+
+
+@njit(**KERNEL)
 def next_grain(grains, room, m, p, d, t_max):
     """Return distance to the next grain's bounding sphere along d from p [unit] or infinity, its centre and its key."""
     r = grains.radius[m]
@@ -78,8 +89,7 @@ def next_grain(grains, room, m, p, d, t_max):
             return math.inf, o, np.uint64(0)
         centre = centre_of(grains, m, i, j, k, sphere)
         if stands(room, m, centre):
-            tile = key_of(grains.seed[m], (i + 1048576) * 2097152 + (j + 1048576), k + 1048576)
-            return t * r, centre, mix(tile + np.uint64(sphere))
+            return t * r, centre, named(grains, m, i, j, k, sphere)
 
 
 @njit(**KERNEL)
@@ -216,6 +226,7 @@ def nothing_packed(media: int, components: int) -> Packed:
     arrays = Grains(
         cells=(cells,),  # one, whatever the number of media, which would be part of the type
         centres=(np.zeros((0, 3)),),
+        around=(around_of(None),),
         radius=np.ones(media),
         seed=np.zeros(media, np.uint64),
         share=np.ones(components),
@@ -229,59 +240,95 @@ def nothing_packed(media: int, components: int) -> Packed:
     return Packed(arrays, [], ())
 
 
-def exemplar(spec: GrainSpec, table: Table, where: str) -> Grain:
-    """Return the grain that a table was made of, found by name or in the mesh file that the scene names."""
+def built_in(table: Table) -> bool:
+    """Return whether a table was made of a grain that is known by name."""
     header = table.header["grain"]
-    if spec.mesh is not None:
-        vertices, faces = read_mesh(spec.mesh)
-        grain = grain_from_mesh(vertices, faces, name=spec.mesh.name)
-    elif header["kind"] == "sphere":
-        grain = load_grain("sphere")
-    else:
+    return header["kind"] == "sphere" or header["name"] in BUILT_INS
+
+
+def mesh_beside(table: Table, folders: Sequence[str | Path]) -> Path | None:
+    """Return the file with the name of the grain that a table was made of, in the first of these folders that has it;
+    None if the grain is built in, or there is no such file."""
+    if built_in(table):
+        return None
+    files = (Path(folder) / Path(table.header["grain"]["name"]).name for folder in folders)
+    return next((file for file in files if file.is_file()), None)
+
+
+def exemplar(spec: GrainSpec, table: Table, where: str, folder: str | None = None) -> Grain:
+    """Return the grain that a table was made of: built in, or from the mesh file that the scene names or, without that,
+    the file of its name beside the table, else in the scene's folder.
+
+    Raises
+    ------
+    SceneError
+        There is no such file, it cannot be read, or it holds another grain.
+    """
+    header = table.header["grain"]
+    beside = [] if isinstance(spec.table, Table) else [spec.table.parent]
+    mesh = spec.mesh or mesh_beside(table, beside if folder is None else [*beside, folder])
+    if mesh is None and built_in(table):
         try:
             grain = load_grain(header["name"], **dict(header["parameters"]))
-        except TSDFError:
+        except TSDFError as error:
+            raise SceneError(f"{where}: {error}; build the table again") from None
+    else:
+        if mesh is None:
             raise SceneError(
-                f'{where}: the table\'s grain {header["name"]!r} is not built in: name its file as mesh = "..."'
-            ) from None
+                f"{where}: the table's grain {header['name']!r} is neither built in nor a file beside the table or the "
+                'scene: name its file as mesh = "..."'
+            )
+        try:
+            vertices, faces = read_mesh(mesh)
+            grain = grain_from_mesh(vertices, faces, name=str(mesh))
+        except TSDFError as error:
+            raise SceneError(f"{where}: {error}") from None
     if grain.mesh_hash != header["mesh_sha256"]:
-        raise SceneError(f"{where}: {grain.name} is not the grain the table was made of; build the table again")
+        raise SceneError(
+            f"{where}: {grain.name} is not the grain the table was made of; name that one's file as mesh, or build the "
+            "table again"
+        )
     return grain
 
 
-def packed(scene: Scene, tables: Sequence[Table]) -> Packed:
+def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed:
     """Pack the media of a scene with the grains of its tables, one table for each component of each medium in turn.
+
+    Grains that are not to be `traced` need not be found.
 
     Raises
     ------
     SceneError
         A grain that cannot be found, a packing fraction beyond what random packings reach.
     """
-    cells, centres, notes = [], [], []
+    titles = [f"{scene.name}: {called('medium', m, medium.name)}" for m, medium in enumerate(scene.media, 1)]
+    own = [(spec, where) for medium, where in zip(scene.media, titles, strict=True) for spec in medium.grains]
+    grains = [
+        exemplar(spec, table, where, scene.folder) if traced else None
+        for (spec, where), table in zip(own, tables, strict=True)
+    ]
+    cells, centres, around, notes = [], [], [], []
     share, eta, kept_apart, chosen = [], [], [], []
     engines: list[Any] = []
     known: dict[str, int] = {}
     planes, centroids, first_facet = [np.zeros((0, 4))], [np.zeros((0, 3))], []
     facets, at = 0, 0
-    for m, medium in enumerate(scene.media, 1):
-        where = f"{scene.name}: {called('medium', m, medium.name)}"
+    for medium, where in zip(scene.media, titles, strict=True):
         try:
             packing = pack(medium.packing_fraction, medium.packing_spheres, medium.packing_seed)
         except TSDFError as error:
             raise SceneError(f"{where}: {error}") from None
         cells.append(cells_of(packing))
         centres.append(np.ascontiguousarray(packing.centres))
+        around.append(around_of(None if traced else packing))
         notes.append(f"{where}: {len(packing.centres)} spheres in a tile of {packing.side:.4g} R, "
                      f"packing fraction {packing.fraction:.6f}")  # fmt: skip
         fractions = np.array([grain.fraction for grain in medium.grains])
         share += list(np.cumsum(fractions) / fractions.sum())
-        for spec in medium.grains:
-            table = tables[at]
-            at += 1
-            grain = exemplar(spec, table, where)
+        for grain, table in zip(grains[at : at + len(fractions)], tables[at : at + len(fractions)], strict=True):
             eta.append(table.header["optics"]["eta"])
             kept_apart.append(table.header["optics"]["fresnel"] == "sp")
-            if grain.kind == "sphere":
+            if grain is None or grain.kind == "sphere":
                 chosen.append(EXACT_SPHERE)
                 continue
             if grain.mesh_hash not in known:
@@ -293,9 +340,11 @@ def packed(scene: Scene, tables: Sequence[Table]) -> Packed:
                 facets += len(corners)
                 engines.append(embree_scene(grain))
             chosen.append(known[grain.mesh_hash])
+        at += len(fractions)
     arrays = Grains(
         cells=tuple(cells),
         centres=tuple(centres),
+        around=tuple(around),
         radius=np.array([medium.radius for medium in scene.media]),
         seed=np.array([medium.packing_seed for medium in scene.media], np.uint64),
         share=np.array(share),

@@ -33,7 +33,7 @@ from tsdf.scene.scene import (
     called,
 )
 from tsdf.vectors import KERNEL, dot, step
-from tsdf.walk.grid import Grid, free_around, grid_of
+from tsdf.walk.grid import GRAZING, Grid, free_around, grid_of, march
 from tsdf.walk.room import BALL, BOX, CLOSED, MESH, OPEN, SLAB, Room, exact_depth, room_of
 
 SLACK = 2e-6  # [of a facet's largest coordinate] a point this near to a facet is on it: 30 float32 ulps
@@ -41,6 +41,7 @@ GRID_CELLS = 2_000_000  # of the grid of facets: half a second to make
 RANGE = 1e6  # of the largest coordinate to the smallest extent of a medium, which a facet that large blurs
 DIGITS = 1e-9  # of a coordinate is the least size there
 LEAST_OVERLAP = 1e-3  # [of the smaller extent] media that overlap by less only touch
+NEAR = 1e-4  # of a way or a ball's radius: what passes a ball so near is looked at with more care
 NONE = -1
 
 
@@ -140,6 +141,28 @@ def clearance(g, m, p):
         q = (p[0] - g.balls[b, 0], p[1] - g.balls[b, 1], p[2] - g.balls[b, 2])
         bound = min(bound, abs(math.sqrt(dot(q, q)) - g.balls[b, 3]))
     return min(bound, free_around(g.grid, p))
+
+
+@njit(**KERNEL)
+def unmet(g, met, m, p, d, end):
+    """Return whether a ray from p of medium m along d is sure to meet neither its boundary nor a surface up to `end`,
+    and whether `met` (engines,) says which facets it meets first."""
+    if g.kind[m] != MESH:
+        t, inside, _ = exact_hit(g.kind[m], g.shape[m], p, d)
+        if not inside or t - end <= GRAZING * g.slack[m]:
+            return False, False
+    if g.balls.shape[0] > 0:
+        t, ball = ball_hit(g.balls, p, d)
+        if t - end <= NEAR * (end + g.balls[ball, 3]):
+            return False, False
+    if g.engines == 0:
+        return True, False
+    if not march(g.grid, met, p, d, end):
+        return False, False
+    for e in range(met.shape[0]):
+        if met[e] != NONE:
+            return False, True
+    return True, True
 
 
 # --------------------------------------------------------------------------------------------- from specs

@@ -74,19 +74,22 @@ def turns(a, b):
     return a[0] < b[0] if a[0] != b[0] else a[1] < b[1]
 
 
-@njit(**KERNEL)
-def passes(corners, facet, p, d):
-    """Return whether the line through p along d passes within a facet: whether its corners, seen along d, turn around
-    p all one way (Woop et al. 2013)."""
-    i, j, k, u, v, w = 0, 1, 2, d[0], d[1], d[2]
-    x, y, z = p
+@njit(forceinline=True, **KERNEL)
+def line_of(p, d):
+    """Return the line through p along d as `passes` takes it: the numbers of two axes and of that along which it runs
+    most, p in that order, and how far it goes along the two for each unit along the third."""
     if abs(d[0]) > max(abs(d[1]), abs(d[2])):
-        i, j, k, u, v, w = 1, 2, 0, d[1], d[2], d[0]
-        x, y, z = p[1], p[2], p[0]
-    elif abs(d[1]) > abs(d[2]):
-        i, j, k, u, v, w = 2, 0, 1, d[2], d[0], d[1]
-        x, y, z = p[2], p[0], p[1]
-    u, v = u / w, v / w
+        return (1, 2, 0), (p[1], p[2], p[0]), d[1] / d[0], d[2] / d[0]
+    if abs(d[1]) > abs(d[2]):
+        return (2, 0, 1), (p[2], p[0], p[1]), d[2] / d[1], d[0] / d[1]
+    return (0, 1, 2), p, d[0] / d[2], d[1] / d[2]
+
+
+@njit(**KERNEL)
+def passes(corners, facet, line):
+    """Return whether a line passes within a facet: whether its corners, seen along it, turn around it all one way
+    (Woop et al. 2013)."""
+    (i, j, k), (x, y, z), u, v = line
     far = corners[facet, 0, k] - z
     a = (corners[facet, 0, i] - x - u * far, corners[facet, 0, j] - y - v * far)
     far = corners[facet, 1, k] - z
@@ -110,7 +113,8 @@ def free_around(grid, p):
     if nx == 0:
         return math.inf if grid.beyond else 0.0
     h = grid.edge
-    x, y, z = (p[0] - grid.low[0]) / h, (p[1] - grid.low[1]) / h, (p[2] - grid.low[2]) / h
+    by = 1.0 / h
+    x, y, z = (p[0] - grid.low[0]) * by, (p[1] - grid.low[1]) * by, (p[2] - grid.low[2]) * by
     if 0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz:
         i, j, k = int(x), int(y), int(z)
         x, y, z = x - i - 0.5, y - j - 0.5, z - k - 0.5
@@ -131,12 +135,16 @@ def free_around(grid, p):
     return h * math.sqrt(x * x + y * y + z * z)
 
 
-@njit(**KERNEL)
-def compared(grid, met, facet, p, d, end):
-    """Note a facet that a ray meets before `end` in `met` (meshes,), if it is the first of its mesh so far; return the
-    distance, or infinity."""
-    t, cosine = plane_hit(grid.planes, facet, p, d)
-    if not (0.0 <= t < end) or cosine == 0.0 or not passes(grid.corners, facet, p, d):
+@njit(forceinline=True, **KERNEL)
+def compared(grid, met, facet, p, d, line, end):
+    """Note a facet that a ray, of that line, meets before `end` in `met` (meshes,), if it is the first of its mesh so
+    far; return the distance, or infinity."""
+    n = (grid.planes[facet, 0], grid.planes[facet, 1], grid.planes[facet, 2])
+    cosine, height = dot(n, d), grid.planes[facet, 3] - dot(n, p)
+    if not (height * cosine >= 0.0 and abs(height) <= end * abs(cosine)):
+        return math.inf
+    t = height / cosine  # most facets are left out without the division
+    if not (0.0 <= t < end) or not passes(grid.corners, facet, line):
         return math.inf
     before = met[grid.mesh[facet]]
     if before == NONE or t < plane_hit(grid.planes, before, p, d)[0]:
@@ -152,16 +160,26 @@ def march(grid, met, p, d, end):
     """
     for e in range(met.shape[0]):
         met[e] = NONE
+    line = line_of(p, d)
     for at in range(grid.outer.shape[0]):
         facet = grid.outer[at]
-        end = min(end, compared(grid, met, facet, p, d, end + GRAZING * grid.thickness[facet]))
+        end = min(end, compared(grid, met, facet, p, d, line, end + GRAZING * grid.thickness[facet]))
     end += grid.margin
     nx, ny, nz = grid.free.shape
     h = grid.edge
+    by = 1.0 / h
+    x, y, z = (p[0] - grid.low[0]) * by, (p[1] - grid.low[1]) * by, (p[2] - grid.low[2]) * by
+    dx, dy, dz = d[0] * by, d[1] * by, d[2] * by
+    if 0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz:
+        i, j, k = int(x), int(y), int(z)
+        if 0.0 <= x + end * dx - i < 1.0 and 0.0 <= y + end * dy - j < 1.0 and 0.0 <= z + end * dz - k < 1.0:
+            # Short ways mostly end in the cell in which they begin
+            cell = (i * ny + j) * nz + k
+            for at in range(grid.first[cell], grid.first[cell + 1]):
+                end = min(end, compared(grid, met, grid.listed[at], p, d, line, end) + grid.margin)
+            return True
     # The ray enters the grid at t and leaves it at `last`
     t, last = 0.0, math.inf
-    x, y, z = (p[0] - grid.low[0]) / h, (p[1] - grid.low[1]) / h, (p[2] - grid.low[2]) / h
-    dx, dy, dz = d[0] / h, d[1] / h, d[2] / h
     ix, iy, iz = inverse(dx), inverse(dy), inverse(dz)
     a, b = -x * ix, (nx - x) * ix
     t, last = max(t, min(a, b)), min(last, max(a, b))
@@ -185,7 +203,7 @@ def march(grid, met, p, d, end):
                 t += free
                 continue
         for at in range(here, there):
-            end = min(end, compared(grid, met, grid.listed[at], p, d, end) + grid.margin)
+            end = min(end, compared(grid, met, grid.listed[at], p, d, line, end) + grid.margin)
         a = (i + (1.0 if dx >= 0.0 else 0.0) - x) * ix
         b = (j + (1.0 if dy >= 0.0 else 0.0) - y) * iy
         c = (k + (1.0 if dz >= 0.0 else 0.0) - z) * iz

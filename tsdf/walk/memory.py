@@ -1,6 +1,6 @@
 """Teleportation that remembers its packing: a chain from bounding sphere to bounding sphere.
 
-Where light left one sphere decides where it enters the next. `neighbours` has the law of that, for one packing fraction
+Where light left one sphere decides where it enters the next. `gaps` has the law of that, for one packing fraction
 and any grain; a table's records by entry have what the grain does then. Between the two, the only state is the side of
 the sphere on which light left it and the impact parameter. The packing goes on for ever and only some of its spheres
 hold grains: one that has no room (`room`), or whose grain is missed, is passed straight through, so a flight into a
@@ -13,13 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tsdf.compiled import njit
+from tsdf.compiled import fetch, njit
 from tsdf.data.sampler import column_of, density, turned
 from tsdf.data.table import Table
 from tsdf.sampling import GOLDEN, mix, unit
-from tsdf.spheres.neighbours import Law
+from tsdf.spheres.gaps import Law
 from tsdf.vectors import KERNEL, cross, dot, frame, step, triple
-from tsdf.walk.geometry import clearance
+from tsdf.walk.geometry import NONE, clearance, unmet
+from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, leap, missing, patience
 from tsdf.walk.lights import draw as draw_light
 from tsdf.walk.room import MESH, stands
 from tsdf.walk.walker import (
@@ -39,6 +40,7 @@ from tsdf.walk.walker import (
     write,
 )
 
+TWICE = np.uint64((2 * int(GOLDEN)) & 0xFFFFFFFFFFFFFFFF)  # two numbers on
 AIMED = 16  # records of each column of cos theta that light aimed at a lamp is drawn from
 
 
@@ -54,8 +56,8 @@ class Memory(NamedTuple):
     (c,): records of the light that met it, in the frame (side of the entry, d x side, d): direction, side of the exit,
     impact parameter of the exit, path length.
 
-    For light that is aimed: aimed (all columns of cos theta, AIMED) int32: numbers column k + record; entered (c,
-    columns, k) float32: impact parameter of their entry; met (c,): hit probability.
+    For light that is aimed: aimed (all columns of cos theta, AIMED, 8) float32: records of light deflected so, as in
+    `grains`, but for the third number, which is the impact parameter of the entry; met (c,): hit probability.
     """
 
     law: np.ndarray
@@ -69,7 +71,6 @@ class Memory(NamedTuple):
     grains: np.ndarray
     kept: np.ndarray
     aimed: np.ndarray
-    entered: np.ndarray
     met: np.ndarray
 
 
@@ -98,6 +99,21 @@ def upright(t, d):
     t = step(t, -dot(t, d), d)
     half = 1.5 - 0.5 * dot(t, t)
     return t[0] * half, t[1] * half, t[2] * half
+
+
+@njit(forceinline=True, **KERNEL)
+def sent(grain, d, t):
+    """Return direction, side, impact parameter and normal with which light leaves a sphere, given a record and the
+    direction and side with which it enters it."""
+    up = cross(d, t)
+    x, y, z = float(grain[0]), float(grain[1]), float(grain[2])
+    new = step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d)
+    half = 1.5 - 0.5 * dot(new, new)
+    new = (new[0] * half, new[1] * half, new[2] * half)
+    x, y, z = float(grain[3]), float(grain[4]), float(grain[5])
+    t = upright(step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d), new)
+    b = float(grain[6])
+    return new, t, b, step(step((0.0, 0.0, 0.0), b, t), math.sqrt(max(0.0, 1.0 - b * b)), new)
 
 
 @njit(**KERNEL)
@@ -132,6 +148,34 @@ def begin(w, memory):
     w.b = b
 
 
+@njit(forceinline=True, **KERNEL)
+def sent_on(memory, c, column, u, t, d):
+    """Return what a grain of component c does to light along d that meets it on side t, its impact parameter in that
+    column, by the record that u stands for: direction, side and impact parameter of the exit, path length [R]."""
+    grain = memory.grains[c, column, int(u * memory.kept[c])]
+    up = cross(d, t)
+    x, y, z = float(grain[0]), float(grain[1]), float(grain[2])
+    new = step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d)
+    half = 1.5 - 0.5 * dot(new, new)
+    new = (new[0] * half, new[1] * half, new[2] * half)
+    x, y, z = float(grain[3]), float(grain[4]), float(grain[5])
+    t = upright(step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d), new)
+    return new, t, float(grain[6]), float(grain[7])
+
+
+@njit(**KERNEL)
+def emerge(w, memory, n):
+    """Draw the sphere that a walker enters next, which has just left one where the outward normal is n."""
+    m, d = w.medium, triple(w.d)
+    away = step(n, -dot(n, d), d)
+    b = math.sqrt(dot(away, away))
+    t = (away[0] / b, away[1] / b, away[2] / b) if b > 1e-9 else frame(d)[0]
+    w.key += GOLDEN
+    gap, t, w.b = onward(memory, m, d, t, min(b, 1.0), mix(w.key))
+    write(w.t, t)
+    w.free = memory.radius[m] * gap
+
+
 @njit(**KERNEL)
 def connect(world, batch, w, amounts, p, c, share, bound):
     """Send off light that arrives from a light and is deflected into the walker's path by a grain.
@@ -154,9 +198,8 @@ def connect(world, batch, w, amounts, p, c, share, bound):
     phase = memory.met[c] * density(tables, column)
     if not phase > 0.0:
         return
-    number = memory.aimed[column, int(u3 * AIMED)]
-    i, k = number // memory.grains.shape[2], number % memory.grains.shape[2]
-    b, grain = float(memory.entered[c, i, k]), memory.grains[c, i, k]
+    grain = memory.aimed[column, int(u3 * AIMED)]
+    b = float(grain[2])
     # The side of the entry is the one from which the record's light goes toward the lamp
     side = step(toward, -cosine, d)
     size = math.sqrt(dot(side, side))
@@ -171,7 +214,10 @@ def connect(world, batch, w, amounts, p, c, share, bound):
     radius = memory.radius[m]
     along = math.sqrt(max(0.0, 1.0 - b * b))
     centre = step(step(p, radius * along, d), -radius * b, t)
-    if (bound <= 2.0 * radius or (room.kind[m] == MESH and not room.whole[m])) and not stands(room, m, centre):
+    sure = room.whole[m] or room.kind[m] != MESH
+    # What is clear of everything is on the side on which p is
+    clear = sure and (bound > 2.0 * radius or clearance(world.geometry, m, centre) >= radius)
+    if not clear and not stands(room, m, centre):
         return
     up = cross(d, t)
     b_out = float(grain[6])
@@ -184,13 +230,7 @@ def connect(world, batch, w, amounts, p, c, share, bound):
     if media.slot[c] >= 0:
         its_amounts[media.slot[c]] += media.scale[c] * float(grain[7])
     cast(w, shadow, step(centre, radius, n), toward, light, phase / (light_pdf + phase) / share, m, key)
-    away = step(n, -dot(n, toward), toward)
-    b = math.sqrt(dot(away, away))
-    t = (away[0] / b, away[1] / b, away[2] / b) if b > 1e-9 else frame(toward)[0]
-    shadow.key += GOLDEN
-    gap, t, shadow.b = onward(memory, m, toward, t, min(b, 1.0), mix(shadow.key))
-    write(shadow.t, t)
-    shadow.free = radius * gap
+    emerge(shadow, memory, n)
 
 
 @njit(**KERNEL)
@@ -204,16 +244,22 @@ def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of
     first, last = media.first[m], media.first[m] + media.kinds[m] - 1
     mean, sure = media.free[m], room.whole[m] or room.kind[m] != MESH
     luck, pdf, steps, met, state = w.luck, w.pdf, 0, 0, LOOK
-    bound, fresh = clearance(g, m, p), True
+    bound, fresh, spot = 0.0 if once else clearance(g, m, p), True, batch.hits.shape[0] - 1
     if free < 0.0:
         begin(w, memory)
         t, b, key, free = triple(w.t), w.b, w.key, w.free
+    again = NEVER
+    if not once and not w.shadow:
+        again = patience(world.leaps, m, missing(world.leaps, m, bound))
     while True:
         if not once and bound <= free:
             if not fresh:
                 bound = clearance(g, m, p)
             if bound <= free:
-                break
+                clear, known = unmet(g, batch.hits[spot], m, p, d, free)
+                if not clear:
+                    w.ray = spot if known else NONE
+                    break
         if steps >= PATIENCE or (sampled and not once and full(batch)):
             state = WAIT
             break
@@ -221,6 +267,24 @@ def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of
         steps += 1
         p = step(p, free, d)
         bound -= free
+        if steps >= again:
+            write(w.p, p)
+            write(w.d, d)
+            write(w.t, t)
+            w.b, w.key, w.luck, w.pdf = b, key, luck, pdf
+            wait, bound_there = leap(world, batch, w, amounts)
+            again = steps + wait
+            if wait <= LEAPT_ON:
+                p, d, t, b, free = triple(w.p), triple(w.d), triple(w.t), w.b, w.free
+                key, luck, pdf, bound = w.key, w.luck, w.pdf, bound_there
+                if wait == ENDS:
+                    state = ENDED
+                    break
+                if w.events + met >= media.limit:
+                    batch.counters[TRUNCATED] += 1
+                    state = ENDED
+                    break
+                continue
         c = first
         if last > first:
             key += GOLDEN
@@ -242,13 +306,14 @@ def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of
         along = math.sqrt(max(0.0, 1.0 - b * b))
         centre = step(step(p, radius * along, d), -radius * b, t)
         column = min(int(b * b * memory.columns[c]), memory.columns[c] - 1)
-        there = True
+        there, hit = True, memory.hit[c, column]
+        if not w.shadow:  # its record, should it be met, comes while the room is looked at
+            fetch(memory.grains[c, column, int(unit(mix(key + (TWICE if hit < 1.0 else GOLDEN))) * memory.kept[c])])
         if bound <= 2.0 * radius or not sure:
             if sure:
                 bound = max(bound, clearance(g, m, p))
             if bound <= 2.0 * radius or not sure:
-                there = stands(room, m, centre)
-        hit = memory.hit[c, column]
+                there = (sure and clearance(g, m, centre) >= radius) or stands(room, m, centre)
         if there and hit < 1.0:
             key += GOLDEN
             there = unit(mix(key)) < hit
@@ -264,19 +329,11 @@ def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of
             met += 1
             u = unit(bits)
             grain = memory.grains[c, column, int(u * memory.kept[c])]
-            up = cross(d, t)
-            x, y, z = float(grain[0]), float(grain[1]), float(grain[2])
             if sampled:
-                pdf = memory.met[c] * density(tables, column_of(tables, c, z))
-                if not pdf > 0.0 or (x == 0.0 and y == 0.0):
+                pdf = memory.met[c] * density(tables, column_of(tables, c, float(grain[2])))
+                if not pdf > 0.0 or (grain[0] == 0.0 and grain[1] == 0.0):
                     pdf = -1.0
-            new = step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d)
-            half = 1.5 - 0.5 * dot(new, new)
-            new = (new[0] * half, new[1] * half, new[2] * half)
-            x, y, z = float(grain[3]), float(grain[4]), float(grain[5])
-            t = upright(step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d), new)
-            d, b = new, float(grain[6])
-            n = step(step((0.0, 0.0, 0.0), b, t), math.sqrt(max(0.0, 1.0 - b * b)), d)
+            d, t, b, n = sent(grain, d, t)
             p = step(centre, radius, n)
             bound -= 2.0 * radius
             slot = media.slot[c]
@@ -394,11 +451,13 @@ def memory_of(
     kept = [len(table.memory["l"]) for table in tables]
     shape = (len(tables), max(columns, default=1), max(kept, default=1))
     hit, records = np.zeros(shape[:2], np.float32), np.zeros((*shape, 8), np.float32)
-    entered, aimed = np.zeros(shape, np.float32), [np.zeros((0, AIMED), np.int32)]
+    aimed = [np.zeros((0, AIMED, 8), np.float32)]
     for c, (table, n, k) in enumerate(zip(tables, columns, kept, strict=True)):
         hit[c, :n] = table.hit
-        records[c, :n, :k], entered[c, :n, :k] = remembered(table)
-        aimed.append(_aimed(table, shape[2]))
+        records[c, :n, :k], entered = remembered(table)
+        chosen = np.unravel_index(_aimed(table, k), (n, k))
+        aimed.append(records[c, :n, :k][chosen])
+        aimed[-1][..., 2] = entered[chosen]
     shares = [np.array([share for _, share in some]) for some in grains]
     return Memory(
         law=law,
@@ -412,6 +471,5 @@ def memory_of(
         grains=records,
         kept=np.array(kept, np.int64),
         aimed=np.concatenate(aimed),
-        entered=entered,
         met=np.array([table.statistics["hit_probability"] for table in tables], np.float64),
     )

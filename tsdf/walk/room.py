@@ -15,6 +15,7 @@ from tsdf.compiled import njit
 from tsdf.vectors import KERNEL, cross, dot, step
 
 CELLS = 1_000_000  # of the grid, about: fewer where a cell would be smaller than a grain
+ROUNDING = 1e-14  # of coordinates: some tens of the last bits of heights over planes
 MESH, SLAB, BOX, BALL = 0, 1, 2, 3  # kinds of shapes
 CLOSED, OPEN = -2, -1  # owners of the facets of opaque surfaces; a medium's are owned by its number
 
@@ -22,10 +23,11 @@ CLOSED, OPEN = -2, -1  # owners of the facets of opaque surfaces; a medium's are
 class Room(NamedTuple):
     """What kernels ask about the room for grains; coordinates as in `geometry.Geometry`.
 
-    kind (m,), shape (m, 6): where centres may lie, if that is no mesh; radius (m,): R [unit]; whole (m,) bool: bounding
-    spheres lie wholly inside a mesh; balls (b, 4): opaque; corners (f, 3, 3), owner (f,) of facets; first (cells + 1,),
-    facets: those that come within R of a cell, one cell after the other; inside (m + 1, cells) bool: whether a cell's
-    middle is in each medium with a mesh and, last, in a closed surface; low (3,), edge, counts (3,): the grid.
+    kind (m,), shape (m, 6): where centres may lie, if that is no mesh; radius (m,): R [unit]; whole (m,) bool:
+    bounding spheres lie wholly inside a mesh; balls (b, 4): opaque; corners (f, 3, 3), owner (f,) of facets; planes
+    (f, 5): their normal, height over the origin, and how far the corners are from it, with rounding; first (cells +
+    1,), facets: those that come within R of a cell, one cell after the other; inside (m + 1, cells) bool: whether a
+    cell's middle is in each medium with a mesh and, last, in a closed surface; low (3,), edge, counts (3,): the grid.
     """
 
     kind: np.ndarray
@@ -35,6 +37,7 @@ class Room(NamedTuple):
     balls: np.ndarray
     corners: np.ndarray
     owner: np.ndarray
+    planes: np.ndarray
     first: np.ndarray
     facets: np.ndarray
     inside: np.ndarray
@@ -96,6 +99,15 @@ def parted(corners, p, q):
     return a == b and b == c
 
 
+@njit(forceinline=True, **KERNEL)
+def height(room, facet, p):
+    """Return how high p is over a facet's plane, less what the facet's corners are off it: none of the facet is nearer
+    than the amount, 0 within."""
+    planes = room.planes
+    h = planes[facet, 0] * p[0] + planes[facet, 1] * p[1] + planes[facet, 2] * p[2] - planes[facet, 3]
+    return math.copysign(max(abs(h) - planes[facet, 4], 0.0), h)
+
+
 @njit(**KERNEL)
 def stands(room, m, c):
     """Return whether a grain of medium m stands where the centre of its bounding sphere is c."""
@@ -121,17 +133,18 @@ def stands(room, m, c):
     inside, body = solid or room.inside[m, cell], room.inside[room.kind.shape[0], cell]
     for at in range(room.first[cell], room.first[cell + 1]):
         facet = room.facets[at]
-        owner, corners = room.owner[facet], room.corners[facet]
-        if owner == m:
-            if parted(corners, c, middle):
+        owner = room.owner[facet]
+        if owner != m and owner >= 0:
+            continue
+        here, corners = height(room, facet, c), room.corners[facet]
+        # Planes tell most facets that neither come near nor part c from the middle
+        if owner != OPEN and here * height(room, facet, middle) <= 0.0 and parted(corners, c, middle):
+            if owner == m:
                 inside = not inside
-            if room.whole[m] and triangle_distance(corners, c) < radius:
-                return False
-        elif owner < 0:
-            if owner == CLOSED and parted(corners, c, middle):
+            else:
                 body = not body
-            if triangle_distance(corners, c) < radius:
-                return False
+        if abs(here) < radius and (owner < 0 or room.whole[m]) and triangle_distance(corners, c) < radius:
+            return False
     return inside and not body
 
 
@@ -170,6 +183,16 @@ def _listed(corners, reach, low, edge, counts, first, facets):
                         first[cell + 1] += 1
 
 
+def _planes(corners: np.ndarray, farthest: float) -> np.ndarray:
+    """Return planes (f, 5) as of `Room`, for points whose coordinates are at most `farthest`."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    heights = np.einsum("ik,ijk->ij", normal, corners)
+    middle = 0.5 * (heights.min(axis=1) + heights.max(axis=1))
+    off = np.ptp(heights, axis=1) + ROUNDING * (np.abs(corners).max(axis=(1, 2)) + farthest)
+    return np.column_stack((normal, middle, off))
+
+
 def room_of(
     kind: np.ndarray,
     shape: np.ndarray,
@@ -196,8 +219,9 @@ def room_of(
     meshes = [(owner, corners, within) for owner, corners, within in meshes if len(corners)]
     if not meshes or not media:
         nothing = np.zeros(0, np.int32)
-        return Room(kind, shape, radius, whole, balls, np.zeros((0, 3, 3)), nothing, np.zeros(0, np.int64), nothing,
-                    np.zeros((media + 1, 0), bool), np.zeros(3), 1.0, np.zeros(3, np.int64))  # fmt: skip
+        return Room(kind, shape, radius, whole, balls, np.zeros((0, 3, 3)), nothing, np.zeros((0, 5)),
+                    np.zeros(0, np.int64), nothing, np.zeros((media + 1, 0), bool), np.zeros(3), 1.0,
+                    np.zeros(3, np.int64))  # fmt: skip
     corners = np.concatenate([c for _, c, _ in meshes])
     owner = np.repeat([o for o, _, _ in meshes], [len(c) for _, c, _ in meshes]).astype(np.int32)
     # Surfaces matter to every medium's grains, a boundary to its own, and if these may stick out, only which side it is
@@ -223,4 +247,5 @@ def room_of(
     for number, _, within in meshes:
         if number != OPEN:  # bodies that overlap count as often as facets between two places do
             inside[number if number >= 0 else media] ^= within(middles)
-    return Room(kind, shape, radius, whole, balls, corners, owner, first, facets, inside, low, edge, counts)
+    planes = _planes(corners, float(max(np.abs(low).max(), np.abs(high).max())))
+    return Room(kind, shape, radius, whole, balls, corners, owner, planes, first, facets, inside, low, edge, counts)

@@ -31,8 +31,10 @@ from tsdf.sampling import GOLDEN, key_of, mix, unit
 from tsdf.vectors import KERNEL, cross, dot, frame, minus, renewed, step, triple
 from tsdf.walk import explicit as X
 from tsdf.walk import memory as M
-from tsdf.walk.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit
+from tsdf.walk.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit, unmet
 from tsdf.walk.grid import GRAZING, march, plane_hit
+from tsdf.walk.hybrid import hand_over
+from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, Leaps, leap, missing, patience
 from tsdf.walk.lights import LightArrays
 from tsdf.walk.lights import draw as draw_light
 from tsdf.walk.lights import radiance as light_from
@@ -48,6 +50,7 @@ from tsdf.walk.walker import (
     FLY,
     GRAIN,
     GRAINS_ASKED,
+    HANDED,
     JUMP,
     LIVE,
     LOOK,
@@ -84,6 +87,7 @@ class WorldArrays(NamedTuple):
     lights: LightArrays
     grains: X.Grains
     memory: M.Memory
+    leaps: Leaps
     absorption: Absorption
 
 
@@ -271,10 +275,11 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
     p, d, key, free = triple(w.p), triple(w.d), w.key, w.free
     mean, reach, travel = media.free[m], media.reach[m], media.travel[m]
     first, last = media.first[m], media.first[m] + media.kinds[m] - 1
-    luck, pdf, steps, state = w.luck, w.pdf, 0, LOOK
-    patience = min(PATIENCE, media.limit - w.events)
-    bound, fresh = clearance(g, m, p), True
+    luck, pdf, steps, leapt, state = w.luck, w.pdf, 0, 0, LOOK
+    most, spot = min(PATIENCE, media.limit - w.events), batch.hits.shape[0] - 1
+    bound, fresh = 0.0 if once else clearance(g, m, p), True
     convex, hair = alone(g, m), HAIR * g.slack[m]
+    again = NEVER if once else patience(world.leaps, m, missing(world.leaps, m, bound))
     while True:
         if free < 0.0:
             key += GOLDEN
@@ -283,8 +288,11 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
             if not fresh:
                 bound = clearance(g, m, p)
             if bound <= free and not (convex and bound > 0.0 and clearance(g, m, step(p, free, d)) > hair):
-                break
-        if steps >= patience or (not once and full(batch)):
+                sure, known = unmet(g, batch.hits[spot], m, p, d, free)
+                if not sure:
+                    w.ray = spot if known else NONE
+                    break
+        if steps >= most or (not once and full(batch)):
             state = WAIT
             break
         fresh = False
@@ -295,6 +303,20 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
             amounts[travel] += free
             luck += absorption.least[travel] * free
         free = -1.0
+        if steps >= again:
+            write(w.p, p)
+            write(w.d, d)
+            w.key, w.luck, w.pdf = key, luck, pdf
+            wait, bound_there = leap(world, batch, w, amounts)
+            again = steps + wait
+            if wait <= LEAPT_ON:
+                leapt += 1
+                p, d, key, free, luck, pdf = triple(w.p), triple(w.d), w.key, w.free, w.luck, w.pdf
+                if wait == ENDS:
+                    state = ENDED
+                    break
+                bound, most = bound_there, min(most, steps + media.limit - w.events)
+                continue
 
         c = first
         if last > first:
@@ -329,9 +351,13 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
             if bound <= size and size > 0.0:
                 aim(w, offset, size, d, length, c)
                 end = step(p, size, triple(w.e))
-                if convex and bound > 0.0 and clearance(g, m, end) > hair:
+                sure, known = convex and bound > 0.0 and clearance(g, m, end) > hair, False
+                if not sure:
+                    sure, known = unmet(g, batch.hits[spot], m, p, triple(w.e), size)
+                if sure:
                     w.mode, p, bound = FLY, end, 0.0
                 else:
+                    w.ray = spot if known else NONE
                     once = True
             else:
                 p = step(p, scale, offset)
@@ -345,8 +371,8 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
             luck = w.luck
         if once:
             break
-    batch.counters[EVENTS] += steps
-    w.events += steps
+    batch.counters[EVENTS] += steps - leapt
+    w.events += steps - leapt
     write(w.p, p)
     write(w.d, d)
     w.key, w.free, w.luck, w.pdf = key, free, luck, pdf
@@ -632,20 +658,23 @@ def pass_through(world, batch, w, amounts, t_b, t, thick):
 
 @njit(**KERNEL)
 def enter(world, w, s, centre, key):
-    """Bring a walker to a grain's bounding sphere at distance s and into the grain's frame."""
+    """Bring a walker to a grain's bounding sphere at distance s and, if the grain is traced, into its frame."""
     grains, media, m = world.grains, world.media, w.medium
     radius = grains.radius[m]
-    x = step(step(triple(w.p), s, triple(w.d)), -1.0, centre)
+    w.component = X.component_of(grains, media.first[m], media.kinds[m], key)
+    w.grain, w.mode, w.state, w.facet, w.pdf, w.ray = key, GRAIN, X.ENTERED, NONE, -1.0, NONE
+    write(w.q, centre)
+    x = step(triple(w.p), s, triple(w.d))
+    if media.traits.answered:
+        write(w.p, x)
+        return
+    x = step(x, -1.0, centre)
     x = (x[0] / radius, x[1] / radius, x[2] / radius)
     size = 1.0 / math.sqrt(dot(x, x))
     p = X.turned(key, (x[0] * size, x[1] * size, x[2] * size), True)
     write(w.p, p)
     write(w.e, p)
     write(w.d, X.turned(key, triple(w.d), True))
-    write(w.q, centre)
-    w.grain, w.mode, w.state, w.facet, w.pdf = key, GRAIN, X.ENTERED, NONE, -1.0
-    w.component = X.component_of(grains, media.first[m], media.kinds[m], key)
-    w.ray = NONE
 
 
 @njit(**KERNEL)
@@ -672,6 +701,7 @@ def in_grain(world, batch, w, amounts, facet):
     if met or grains.exemplar[c] == X.EXACT_SPHERE:
         batch.counters[EVENTS] += 1
         w.events += 1
+        w.single += 1
     p = step(p, X.rim_of(p, d), d)
     out = X.turned(w.grain, p, False)
     write(w.p, step(triple(w.q), grains.radius[w.medium], out))
@@ -684,12 +714,17 @@ def in_grain(world, batch, w, amounts, facet):
         w.key += GOLDEN
         if not lives(w, w.key):
             return ENDED
-    return LOOK
+    return LOOK if w.single < media.singles else HANDED
 
 
 @njit(**KERNEL)
 def meet_grain(world, batch, w, amounts):
-    """Take a walker on in its grain, or ask the ray engine for the facet that it meets; return what becomes of it."""
+    """Take a walker on in its grain, or ask for the facet that it meets or the record; return what becomes of it."""
+    if world.media.traits.answered:  # by `packed`, between two turns, which may have taken it to its end
+        if w.state & X.LEFT == 0:
+            return WAIT
+        w.mode = FLY
+        return ENDED
     e = world.grains.exemplar[w.component]
     if e == X.EXACT_SPHERE:
         return in_grain(world, batch, w, amounts, NONE)
@@ -735,7 +770,8 @@ def ask(batch, w):
 
 @njit(**KERNEL)
 def follow(world, batch, w, amounts):
-    """Take a walker as far as it comes without the ray engine; return ENDED or WAIT."""
+    """Take a walker as far as it comes without the ray engine; return ENDED, WAIT, or HANDED where the world's law ends
+    and another's begins."""
     engines, turns = world.geometry.engines > 0, 0
     while True:
         if w.mode == GRAIN:
@@ -766,6 +802,18 @@ def follow(world, batch, w, amounts):
 
 
 @njit(**KERNEL)
+def conduct(near, world, near_batch, batch, w, amounts):
+    """Take a walker as far as it comes without the ray engine, through single grains while it has some to meet, then
+    through the world; return ENDED or WAIT."""
+    if w.single < world.media.singles:
+        state = follow(near, near_batch, w, amounts)
+        if state != HANDED:
+            return state
+        hand_over(world, w)
+    return follow(world, batch, w, amounts)
+
+
+@njit(**KERNEL)
 def keep(batch, w, amounts):
     """Have a walker go on in the next turn."""
     live = batch.asked[LIVE]
@@ -775,9 +823,11 @@ def keep(batch, w, amounts):
 
 
 @njit(**KERNEL)
-def advance(world, batch, count):
+def advance(near, world, near_batch, batch, count):
     """Take each walker of a batch, the first `count`, as far as it comes without the ray engine.
 
+    `near` is the world of single grains, met first, and the same world where these are all there is, or not there.
+    `near_batch` has its answers of the ray engine, and is the same batch where places are the same.
     What goes on is written to `out` and `out_amounts`, the rays it needs to `starts` and `ways`, and for the exemplars
     to `grain_starts` and `grain_ways`; `asked` tells how many. What has ended stays in `walkers`, the number of its
     sample inverted (~sample); but for shadows, its weight is 0 unless it left the scene or reached the limit of events.
@@ -789,11 +839,11 @@ def advance(world, batch, count):
         w, amounts = batch.walkers[i], batch.amounts[i]
         asked[MOST] = batch.out.shape[0] - (count - i) - 2
         first = asked[LIVE]
-        state = follow(world, batch, w, amounts)
+        state = conduct(near, world, near_batch, batch, w, amounts)
         # The shadows that were born on the way
         last, asked[LIVE] = asked[LIVE], first
         for k in range(first, last):
-            if follow(world, batch, batch.out[k], batch.out_amounts[k]) != ENDED:
+            if conduct(near, world, near_batch, batch, batch.out[k], batch.out_amounts[k]) != ENDED:
                 keep(batch, batch.out[k], batch.out_amounts[k])
         if state == ENDED:
             w.sample = ~w.sample
@@ -822,6 +872,6 @@ def spawn(batch, live, job, first, count):
             w.colour[k] = 1.0
         w.weight, w.luck, w.pdf, w.free, w.skip = 1.0, 0.0, -1.0, -1.0, 0.0
         w.key, w.events, w.sample, w.ray, w.medium, w.mode = key + GOLDEN, 0, local, NONE, UNKNOWN, FLY
-        w.tries, w.shadow = 0, 0
+        w.tries, w.shadow, w.single = 0, 0, 0
         for k in range(batch.amounts.shape[1]):
             batch.amounts[live + i, k] = 0.0

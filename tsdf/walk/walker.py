@@ -19,19 +19,20 @@ WALKER = np.dtype(
      ("luck", "f8"), ("pdf", "f8"), ("free", "f8"), ("length", "f8"), ("gained", "f8"), ("skip", "f8"), ("b", "f8"),
      ("key", "u8"), ("grain", "u8"),
      ("events", "i8"), ("sample", "i4"), ("ray", "i4"), ("medium", "i4"), ("mode", "i4"), ("component", "i4"),
-     ("facet", "i4"), ("state", "i4"), ("tries", "i4"), ("shadow", "i4")]
+     ("facet", "i4"), ("state", "i4"), ("tries", "i4"), ("shadow", "i4"), ("single", "i4")]
 )  # fmt: skip
 # p, d: place and direction. q, e, length, gained: of a jump, the direction after it, its own, its length and what it
 # adds to the amounts; in a grain, q is its centre, e where the ray starts. luck: logarithm of a bound of the
 # throughput. pdf: density per steradian with which d was drawn, -1 for none. free: the free path still to fly, < 0 if
 # not drawn. skip: how far beyond p the ray engine starts. ray: row of the ray engine's answers, -1 for none. t, b: of
-# the bounding sphere at the end of the free path, the side on which it is entered and the impact parameter [R].
+# the bounding sphere at the end of the free path, the side on which it is entered and the impact parameter [R]. single:
+# grains met one by one so far.
 FLY, JUMP, GRAIN = 0, 1, 2
 UNKNOWN = -2  # medium of a walker that may have crossed a boundary
 
-EVENTS, RAYS, TRUNCATED, FAULTS = range(4)  # counters
+EVENTS, RAYS, TRUNCATED, FAULTS, LEAPT, LEAPS = range(6)  # counters; LEAPT of the events, in so many LEAPS
 LIVE, MOST, ASKED, GRAINS_ASKED = range(4)  # of `Batch.asked`
-CLEAR, LOOK, WAIT, ENDED = range(4)  # what becomes of a walker: it has met nothing yet, must look where it goes, ...
+CLEAR, LOOK, WAIT, ENDED, HANDED = range(5)  # what becomes of a walker: it has met nothing, must look ahead, ...
 
 OTHER = np.uint64(0xA5A5A5A5A5A5A5A5)
 LOW = np.uint64(0xFFFFFFFF)
@@ -50,7 +51,8 @@ class Media(NamedTuple):
     first component and how many it has; travel: amount that counts the length flown, or -1. Of components: choice, the
     running sum of the probability that the next grain met is of it; scale: what one event's path length [R], or the
     event itself where there is none, counts in the amount `slot`; slot, -1 for none; g: mean cosine of the
-    Henyey-Greenstein lobe. Lengths in scene units. limit: events after which a path is given up.
+    Henyey-Greenstein lobe. Lengths in scene units. limit: events after which a path is given up. singles: grains
+    that are met one by one before the level's own law takes over.
     """
 
     traits: Traits
@@ -64,6 +66,7 @@ class Media(NamedTuple):
     slot: np.ndarray
     g: np.ndarray
     limit: int
+    singles: int = 0
 
 
 class Absorption(NamedTuple):
@@ -83,7 +86,7 @@ class Batch(NamedTuple):
     that are born; starts and ways (n, 3) float32 the rays in the scene, grain_starts and grain_ways (e, n, 3) those in
     the exemplars, hits (n + 1, engines) and grain_hits (e, n) int32 the facets that they meet, the last of
     hits those of the walker under way. radiance (samples, 3);
-    counters (4,): see EVENTS; asked (3 + e,): walkers in out, the number of them from which on no more are made, rays
+    counters (6,): see EVENTS; asked (3 + e,): walkers in out, the number of them from which on no more are made, rays
     asked for in the scene, and in each exemplar.
     """
 
@@ -184,7 +187,7 @@ def cast(w, shadow, p, toward, light, weight, m, key):
     shadow.weight, shadow.luck, shadow.pdf, shadow.free = 1.0, 0.0, -1.0, -1.0
     shadow.skip, shadow.key, shadow.events = 0.0, key, 0
     shadow.sample, shadow.ray, shadow.medium, shadow.mode = w.sample, NONE, m, FLY
-    shadow.tries, shadow.shadow = 0, 1
+    shadow.tries, shadow.shadow, shadow.single = 0, 1, w.single
 
 
 @njit(**KERNEL)

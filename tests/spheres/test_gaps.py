@@ -16,12 +16,13 @@ from tsdf.cli.packing import main as packing_command
 from tsdf.data import container
 from tsdf.data.table import thawed
 from tsdf.errors import FormatError, TSDFError, UsageError
-from tsdf.spheres import neighbours
-from tsdf.spheres.neighbours import Law, PackingTable, Records, gather, law, mean_gap, reduce, shipped, spread
+from tsdf.spheres import gaps, packing_table
+from tsdf.spheres.gaps import Law, Records, gather, mean_gap, reduce, spread
 from tsdf.spheres.packing import Packing, pack
+from tsdf.spheres.packing_table import PackingTable, law, shipped
 
 ROOT = Path(__file__).parents[2]
-SHIPPED = ROOT / "reference_data" / neighbours.SHIPPED
+SHIPPED = ROOT / "reference_data" / packing_table.SHIPPED
 SPEC = (ROOT / "schema" / "PACKING.md").read_text("utf-8")
 F = 0.5
 
@@ -275,7 +276,7 @@ def without(table: PackingTable, index: int) -> PackingTable:
     return PackingTable(header, np.delete(table.pixels, np.s_[index * rows : (index + 1) * rows], axis=0))
 
 
-@pytest.mark.parametrize("index", range(len(neighbours.FRACTIONS) - 1))
+@pytest.mark.parametrize("index", range(len(packing_table.FRACTIONS) - 1))
 def test_interpolation_finds_what_is_left_out(index: int) -> None:
     """The displacement of a fraction from the records of the others, twice as far apart as they are in truth.
 
@@ -293,7 +294,7 @@ def test_interpolation_finds_what_is_left_out(index: int) -> None:
 
 def test_thin_packings_forget() -> None:
     """The limit: gaps exponential, all independent; the cell of the exit does not show."""
-    thin = neighbours.thin(16, 256)
+    thin = packing_table.thin(16, 256)
     assert thin.gap.mean() == pytest.approx(1.0) and (thin.gap**2).mean() == pytest.approx(2.0, rel=0.02)
     columns = [thin.gap.ravel(), thin.entry_b2.ravel(), thin.azimuth.ravel(), np.repeat(np.arange(16), 256)]
     assert abs(np.corrcoef(columns) - np.eye(4)).max() < 0.02  # of chance alone 1 / 64
@@ -326,10 +327,10 @@ def test_round_trip(tmp_path: Path) -> None:
     import tsdf
 
     one, two = tmp_path / "one.exr", tmp_path / "two.exr"
-    neighbours.write(small(), one)
-    neighbours.write(neighbours.read(one), two)
+    packing_table.write(small(), one)
+    packing_table.write(packing_table.read(one), two)
     assert one.read_bytes() == two.read_bytes()
-    got = neighbours.read(two)
+    got = packing_table.read(two)
     assert np.array_equal(got.pixels, small().pixels) and not got.pixels.flags.writeable
     assert got.fractions == (0.05, 0.1) and (got.cells, got.records) == (2, 4)
     assert got.tabulated(1).azimuth.max() == math.pi
@@ -337,20 +338,20 @@ def test_round_trip(tmp_path: Path) -> None:
         tsdf.read(one)
     grain = ROOT / "reference_data" / "golden" / "valid" / "minimal.tsdf.exr"
     with pytest.raises(FormatError, match="not a packing table; name a file made by tsdf-packing"):
-        neighbours.read(grain)
+        packing_table.read(grain)
 
 
 def test_every_damaged_byte_is_noticed(tmp_path: Path) -> None:
     """Flip a bit anywhere, or cut the file anywhere: an error with a code and a place, never a table."""
     path = tmp_path / "small.exr"
-    neighbours.write(small(), path)
+    packing_table.write(small(), path)
     data, rng = path.read_bytes(), np.random.default_rng(0)
     for at in rng.choice(len(data), 400, replace=False):
         changed = bytearray(data)
         changed[at] ^= 1 << rng.integers(8)
         for bad in (bytes(changed), data[:at]):
-            table, findings = container.inspect(bad, neighbours.FORMAT)
-            assert table is None and findings and all(f.code in neighbours.CODES for f in findings)
+            table, findings = container.inspect(bad, packing_table.FORMAT)
+            assert table is None and findings and all(f.code in packing_table.CODES for f in findings)
             assert all("\n" not in f.message for f in findings)
 
 
@@ -408,12 +409,12 @@ def test_rules_that_are_broken(name: str, tmp_path: Path) -> None:
     alter(header, pixels)
     code = name.split("-")[0]
     with pytest.raises(TSDFError, match=code):
-        neighbours.write(PackingTable(header, pixels), tmp_path / "bad.exr")
+        packing_table.write(PackingTable(header, pixels), tmp_path / "bad.exr")
     assert not list(tmp_path.iterdir())
     if code.startswith("MANIFEST"):
-        found = list(neighbours._broken_manifest(header, 2, 24, False))
+        found = list(packing_table._broken_manifest(header, 2, 24, False))
     elif code.startswith("VALUE"):
-        found = list(neighbours._broken_values(PackingTable(header, pixels)))
+        found = list(packing_table._broken_values(PackingTable(header, pixels)))
     else:
         return
     assert found[0][:2] == (code, place)
@@ -423,9 +424,9 @@ def test_the_specification_lists_the_rules_and_the_keys() -> None:
     from jsonschema import Draft202012Validator
 
     listed = re.findall(r"^\| `([A-Z_0-9]+)` \| (\w+) \| (.*) \|$", SPEC, flags=re.M)
-    assert {code: (severity, rule) for code, severity, rule in listed} == neighbours.CODES
+    assert {code: (severity, rule) for code, severity, rule in listed} == packing_table.CODES
     broken = {name.split("-")[0] for name in BREACHES}
-    assert {code for code in neighbours.CODES if code.startswith(("MANIFEST", "VALUE"))} <= broken
+    assert {code for code in packing_table.CODES if code.startswith(("MANIFEST", "VALUE"))} <= broken
     schema = json.loads((ROOT / "schema" / "packing.schema.json").read_text("ascii"))
     Draft202012Validator.check_schema(schema)
 
@@ -450,7 +451,7 @@ def test_shipped_table() -> None:
     assert hashlib.sha256(data).hexdigest() in (ROOT / "reference_data" / "README.md").read_text("utf-8")
     assert len(data) < 1e6
     table = shipped()
-    assert table is shipped() and table.fractions == neighbours.FRACTIONS
+    assert table is shipped() and table.fractions == packing_table.FRACTIONS
     made = table.header["provenance"]
     assert made["packings"] >= 4 and made["spheres"] == 2000
     command = [
@@ -469,7 +470,7 @@ def test_shipped_table() -> None:
 def test_shipped_table_is_of_packings(whole: Records) -> None:
     """A packing of few spheres, never seen by the table, has its statistics; another fraction's are far off."""
     entry = shipped().header["fractions"][shipped().fractions.index(F)]
-    mine, other = neighbours.measured(whole, F), shipped().header["fractions"][-1]["statistics"]
+    mine, other = gaps.measured(whole, F), shipped().header["fractions"][-1]["statistics"]
     for key, tolerance in (("gap_second_moment", 0.02), ("tangent_correlation", 0.003)):
         assert abs(mine[key] - entry["statistics"][key]) < tolerance < abs(mine[key] - other[key])
 
@@ -488,7 +489,7 @@ def test_command_makes_a_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     result = run(*map(str, QUICK), "--fraction", "0.1", "--out", one)
     assert result.exit_code == 0, result.stderr
     assert "0.3 " in result.stdout and "4 cells of exit_b2, 8 records each" in result.stdout
-    table = neighbours.read(one)
+    table = packing_table.read(one)
     assert table.fractions == (0.1, 0.3) and (table.cells, table.records) == (4, 8)
     command = table.header["provenance"]["command"].split()
     result = run(*command[1:], "--out", two, "--quiet")
@@ -501,8 +502,8 @@ def test_command_makes_a_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_command_shows_the_shipped_table() -> None:
     result = run("--info")
     assert result.exit_code == 0
-    rows = result.stdout.splitlines()[-len(neighbours.FRACTIONS) :]
-    assert [float(row.split()[0]) for row in rows] == list(neighbours.FRACTIONS)
+    rows = result.stdout.splitlines()[-len(packing_table.FRACTIONS) :]
+    assert [float(row.split()[0]) for row in rows] == list(packing_table.FRACTIONS)
 
 
 @pytest.mark.parametrize(
