@@ -6,6 +6,7 @@ from pathlib import Path
 import click
 
 from tsdf.cli.common import Tool, check_output, plain, write_text
+from tsdf.cli.sizes import colour_of, coloured, in_words, said, sized
 
 TARGETS = ("pbrt", "blender", "openpbr", "materialx", "arnold", "karma", "csv", "npz")
 
@@ -13,23 +14,21 @@ TARGETS = ("pbrt", "blender", "openpbr", "materialx", "arnold", "karma", "csv", 
 @click.command("tsdf-export", cls=Tool)
 @click.argument("file")
 @click.option("--to", required=True, type=click.Choice(TARGETS), help="What to write for.")
-@click.option(
-    "--packing", required=True, type=float, metavar="F",
-    help="Share of the volume in bounding spheres [1], 0 < F <= 0.74.",
-)  # fmt: skip
-@click.option(
-    "--radius", required=True, type=float, metavar="L",
-    help="Bounding radius of the grains in scene units.",
-)  # fmt: skip
+@sized
+@coloured
 @click.option(
     "--absorption", metavar="X/R",
     help="Absorption coefficient of the grains' material: X/R is X over the bounding radius, X/unit per scene unit, "
     "X/mm (um, cm, m) per length, with --unit; X is one number, or red,green,blue.  [default: 0]",
 )  # fmt: skip
-@click.option("--material", metavar="NAME", help="Absorb as this material instead (ice, say); needs --unit.")
 @click.option(
-    "--unit", type=float, metavar="METRES", help="Length of the scene unit; only --material and X/mm need it."
-)
+    "--material", metavar="NAME|FILE",
+    help="Absorb as this material instead (ice, say, or a file as of tsdf-build --material); needs --unit.",
+)  # fmt: skip
+@click.option(
+    "--unit", type=float, metavar="METRES",
+    help="Length of the scene unit; only --material, X/mm and --ssa need it.",
+)  # fmt: skip
 @click.option(
     "--lobes", type=click.IntRange(1, 2),
     help="Henyey-Greenstein lobes where the target can mix two.  [default: two where needed; Blender: 1]",
@@ -44,30 +43,35 @@ TARGETS = ("pbrt", "blender", "openpbr", "materialx", "arnold", "karma", "csv", 
 @click.option("--measure", is_flag=True, help="Render a slab of 40 R to find the error of point scatterers.")
 @click.option("--out", metavar="PATH", help="File to write.  [default: standard output; npz needs it]")
 def main(
-    file: str, to: str, packing: float, radius: float, absorption: str | None, material: str | None,
-    unit: float | None, lobes: int | None, kept: float, thickness: float | None, measure: bool, out: str | None,
+    file: str, to: str, absorption: str | None, material: str | None, deep_colour: str | None,
+    colour_thickness: float | None, unit: float | None, lobes: int | None, kept: float, thickness: float | None,
+    measure: bool, out: str | None, **options: float | None,
 ) -> None:  # fmt: skip
     """Write the medium of grains of the table FILE for another renderer, or the table as plain arrays.
 
     Each text says what level of model it stands for, what that costs and how many bounces it needs; a page on each
     target is in the folder docs.
     """
-    from tsdf.cli.absorption import times_radius
+    from tsdf.cli.absorption import conventions, times_radius
     from tsdf.errors import UsageError
+    from tsdf.scene.sizes import SIZES
 
     if not 0.0 < kept < 1.0:
         raise UsageError(f"--kept is a share > 0 and < 1, not {kept:g}")
     if thickness is not None and not thickness > 0.0:
         raise UsageError(f"--thickness is a number > 0, not {thickness:g}")
-    if absorption is not None and material is not None:
-        raise UsageError("--absorption and --material both say how grains absorb: give one")
+    words, colour = said(options), colour_of(deep_colour)
+    if sum(given is not None for given in (absorption, material, deep_colour)) > 1:
+        raise UsageError("--absorption, --material and --deep-colour all say how grains absorb: give one")
     if material is not None and unit is None:
         raise UsageError(f"absorption of {plain(material)} is per metre: say with --unit how long the scene unit is")
-    if not 1e-30 <= radius <= 1e30:
-        raise UsageError(f"--radius is a number of scene units from 1e-30 to 1e30, not {radius:g}")
-    if unit is not None and not 0.0 < unit < math.inf:
-        raise UsageError(f"--unit is a finite number of metres > 0, not {unit:g}")
-    products = times_radius(absorption, radius, unit, colours=True)
+    if not any(word in words for word in SIZES):
+        raise UsageError("say how large grains are: give one of --radius, --effective-radius, --sieve, ... (--help)")
+    for name, value in (("--unit", unit), ("--colour-thickness", colour_thickness)):
+        if value is not None and not 0.0 < value < math.inf:
+            raise UsageError(f"{name} is a finite number > 0, not {value:g}")
+    if not 1e-30 <= words.get("radius", 1.0) <= 1e30:
+        raise UsageError(f"--radius is a number of scene units from 1e-30 to 1e30, not {words['radius']:g}")
     if to == "npz" and out is None:
         raise UsageError("npz is no text: say with --out where to write it")
     if out is not None:
@@ -76,19 +80,32 @@ def main(
     from tsdf.data import format
     from tsdf.loaders import export
     from tsdf.loaders.pointmedium import point_medium
-    from tsdf.scene.scene import Absorption
+    from tsdf.scene.deep import absorption_of_colour
+    from tsdf.scene.scene import Absorption, absorbing_material
 
     table = format.read(file)
+    grains = in_words(table, words, unit)
+    packing, radius = grains.fraction, grains.radius
+    products = times_radius(absorption, radius, unit, colours=True)
+    if colour:
+        thick = math.inf if colour_thickness is None else colour_thickness / radius
+        products = absorption_of_colour(table, colour, thick, packing)
     if material is not None:
-        _check_material(material)
-        spec = Absorption("spectral", material=material)
+        spec = Absorption("spectral", material=absorbing_material(material))
     elif len(products) == 1:
         spec = Absorption("grey", (products[0] / radius,))
     else:
         spec = Absorption("rgb", tuple(x / radius for x in products))
     medium = point_medium(table, packing, radius, spec, unit)
     measured = export.level_errors(medium, export.SLAB * radius) if measure else None
-    request = export.Request(medium, lobes, kept, math.inf if thickness is None else thickness, measured)
+    told = [grains.summary()]
+    if colour:
+        asked = (
+            f"colour {plain(deep_colour)} where {'deep' if colour_thickness is None else f'{colour_thickness:g} thick'}"
+        )
+        told.append(f"{asked}: absorption {conventions(products, radius, unit)}")
+    deep = math.inf if thickness is None else thickness
+    request = export.Request(medium, lobes, kept, deep, measured, tuple(told))
     if to == "npz":
         assert out is not None
         export.write_npz(request, out)
@@ -98,12 +115,3 @@ def main(
         click.echo(text, nl=False)
         return
     write_text(out, text)
-
-
-def _check_material(name: str) -> None:
-    """Refuse what does not absorb or is not known."""
-    from tsdf.errors import UsageError
-    from tsdf.scene.scene import ABSORBING
-
-    if name not in ABSORBING:
-        raise UsageError(f"--material: no absorbing material {plain(name)!r}; there are {', '.join(ABSORBING)}")

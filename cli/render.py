@@ -98,6 +98,8 @@ def main(
             click.echo("interrupted before the first sample: nothing is written", err=True)
             return interrupt_status()
         save(made, picture, seed, out)
+    if picture.trust is not None and picture.trust.doubt is not None:
+        click.echo(f"warning: {picture.trust.doubt}", err=True)
     if not quiet or picture.interrupted:
         summary(made, picture, out)
     return interrupt_status() if picture.interrupted else 0
@@ -123,6 +125,14 @@ def save(world: "World", picture: "Picture", seed: int, out: Path) -> None:
     }
     if singles := world.scene.render.explicit_grains:
         facts["explicit_grains"] = singles
+    if picture.trust is not None:
+        facts |= {
+            "trusted": picture.trust.doubt is None,
+            "vov": picture.trust.vov,
+            "slope": picture.trust.slope if math.isfinite(picture.trust.slope) else None,
+            "met_by_chance": 1.0 / picture.trust.chance if picture.trust.chance > 0.0 else None,
+            "unsure_pixels": picture.trust.unsure,
+        }
     image.write_exr(out, picture.rgb, picture.variance, {"tsdf_render": json.dumps(facts)})
     image.write_png(out.with_suffix(".png"), picture.rgb, world.scene.camera.exposure)
 

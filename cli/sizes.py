@@ -65,8 +65,8 @@ def said(options: Mapping[str, float | None]) -> dict[str, float]:
     words = {word: value for word in OPTIONS if (value := options.get(word)) is not None}
     for word, value in words.items():
         if not 0.0 < value < math.inf:
-            most = " and at most 0.74" if word == "packing_fraction" else ""
-            raise UsageError(f"{OPTIONS[word][0]} is a finite number > 0{most}, not {value:g}")
+            what = "packing fraction > 0 and at most 0.74" if word == "packing_fraction" else "finite number > 0"
+            raise UsageError(f"{OPTIONS[word][0]} is a {what}, not {value:g}")
     return words
 
 

@@ -104,6 +104,7 @@ class Request:
     kept: float = 0.99  # share of the light to keep [1]
     thickness: float = math.inf  # of the body [scene unit]
     measured: dict[str, tuple[float, float]] | None = None
+    said: tuple[str, ...] = ()  # more to say of the grains, one line each: sizes in others' words
 
     @property
     def name(self) -> str:
@@ -112,7 +113,7 @@ class Request:
         return word if word[:1].isalpha() else f"grain_{word}".rstrip("_")
 
     def notes(self, lobes: int = 1) -> list[str]:
-        return notes(self.medium, lobes, self.measured)
+        return [*notes(self.medium, lobes, self.measured), *self.said]
 
     @cached_property
     def bounces(self) -> int:

@@ -26,7 +26,7 @@ DOORS = {
     "OpenEXR": {"container", "image"},
     "colour": {"image"},
     "PIL": {"image"},
-    "matplotlib": {"plots"},
+    "matplotlib": {"plots", "spectral_plots"},
     "jsonschema": {"container"},
     "yaml": {"constants"},
 }

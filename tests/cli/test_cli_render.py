@@ -42,6 +42,27 @@ def facts(path: Path) -> dict:
     return json.loads(image.read_exr(path).attributes["tsdf_render"])
 
 
+def test_an_error_bar_that_cannot_be_trusted(folder: Path) -> None:
+    """Beads under a small sun that level explicit cannot aim at: one line, also when quiet, and in the file; the same
+    under a bright sky are trusted, and nothing is said."""
+    shutil.copy(CHECKS / "sphere.tsdf.exr", folder)
+    beads = SCENE.replace("cube", "sphere").replace("absorption = [2.0, 2.0, 4.0]\n", "")
+    (folder / "trusted.toml").write_text(beads)
+    (folder / "doubted.toml").write_text(
+        beads.replace('type = "constant"\nradiance', 'type = "sun"\ndirection = [0.3, -0.6, 0.7]\nirradiance')
+    )
+    words = ("--level", "explicit", "--quiet", "--spp", "4")
+    for name, trusted in (("trusted", True), ("doubted", False)):
+        out = folder / f"{name}.exr"
+        result = CliRunner().invoke(main, [str(folder / f"{name}.toml"), "--out", str(out), *words])
+        assert (result.exit_code, result.stdout) == (0, "")
+        warned = result.stderr.startswith("warning: the error of the picture cannot be trusted: suns")
+        assert warned == (not trusted) and result.stderr.count("\n") == int(warned)
+        said = facts(out)
+        assert said["trusted"] is trusted and (said["met_by_chance"] is None) == trusted
+        assert {"vov", "slope", "unsure_pixels"} <= set(said)
+
+
 def test_what_is_written(folder: Path) -> None:
     """The picture and its variance, how it was made, and the same developed beside it."""
     result = run(folder)

@@ -481,6 +481,28 @@ def test_npz_holds_the_records_by_entry(tmp_path: Path) -> None:
 GOOD = {"--to": "pbrt", "--packing": "0.6", "--radius": "1"}
 
 
+def test_sizes_densities_and_colours_in_any_word(cube: Table, tmp_path: Path) -> None:
+    """The medium that radius, packing and absorption say, said otherwise; both sides stand in the text."""
+    from tsdf.scene.deep import absorption_of_colour
+    from tsdf.scene.sizes import convert
+
+    facts = convert([(cube, 1.0)], {"radius": 0.5, "packing_fraction": 0.6}, 0.001).facts()
+    xs = absorption_of_colour(cube, (0.9, 0.5, 0.2))
+    ours = ("--radius", 0.5, "--packing", 0.6, "--absorption", ",".join(map(repr, xs)) + "/R")
+    theirs = ("--effective-radius", facts["effective_radius"], "--solid-fraction", facts["solid_fraction"])
+    a, b = (
+        run("--to", "pbrt", *words) for words in (ours, (*theirs, "--deep-colour", "0.9,0.5,0.2", "--unit", "0.001"))
+    )
+    assert b.exit_code == 0, b.stderr
+    for x, y in zip(pbrt_medium(a.stdout).values(), pbrt_medium(b.stdout).values(), strict=True):
+        assert y == (pytest.approx(x, rel=1e-6) if not isinstance(x, str) else x)
+    for part in ("effective_radius", "solid_fraction", "colour 0.9,0.5,0.2 where deep", "/ R = ", "/ unit = ", "/ m"):
+        assert part in b.stdout
+    own = tmp_path / "own.csv"
+    own.write_text("wavelength_nm,n,k\n300,1.5,1e-7\n900,1.5,1e-7\n")
+    assert run("--to", "pbrt", "--packing", 0.6, "--radius", 1, "--material", own, "--unit", 1e-3).exit_code == 0
+
+
 @pytest.mark.parametrize(
     "change, status, part",
     [
@@ -490,6 +512,11 @@ GOOD = {"--to": "pbrt", "--packing": "0.6", "--radius": "1"}
         ({"--radius": "0"}, 2, "--radius"),
         ({"--radius": "-1"}, 2, "--radius"),
         ({"--radius": "inf"}, 2, "--radius"),
+        ({"--sieve": "1"}, 2, "--radius, --sieve"),
+        ({"--density": "1"}, 2, "--packing, --density"),
+        ({"--deep-colour": "1"}, 2, "without any absorption it is 1"),
+        ({"--deep-colour": "0.5", "--absorption": "1"}, 2, "give one"),
+        ({"--material": "none.csv", "--unit": "1"}, 1, "none.csv: no such file"),
         ({"--to": "maya"}, 2, "'karma'"),
         ({"--to": "npz"}, 2, "--out"),
         ({"--absorption": "-1"}, 2, "--absorption"),

@@ -191,7 +191,7 @@ def test_noise_of_a_profile_is_what_equal_profiles_differ_by(grain: GrainSpec) -
 
 def test_lost_paths_are_counted_and_left_out() -> None:
     """A path that did not come to its last block has no number; the mean is that of the others."""
-    nothing = experiment.Ends(*(np.zeros((0, 3)) for _ in range(3)), np.zeros(0), np.zeros((0, 0)), 0, 0.0)
+    nothing = experiment.Ends(*(np.zeros((0, 3)) for _ in range(3)), np.zeros(0), np.zeros((0, 0)), 0, 0, 0.0)
     sums = Sums()
     sums.add(np.array([[1.0], [math.nan], [3.0]]), nothing)
     assert (sums.paths, sums.lost, sums.mean[0]) == (2, 1, 2.0)

@@ -7,7 +7,7 @@ import csv
 import math
 import re
 import stat
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +33,19 @@ def constants_of(material: str, wavelength_nm: float) -> OpticalConstants:
     TSDFError
         If the file cannot be read.
     """
+    return constants_over(material, [wavelength_nm])[0]
+
+
+def constants_over(material: str, wavelengths_nm: Iterable[float]) -> list[OpticalConstants]:
+    """Return n and k as `constants_of` does, at several wavelengths; a file is read once."""
     path = Path(material)
     if material in MATERIALS or not (path.suffix or path.exists()):
-        return optical_constants(material, wavelength_nm)
+        return [optical_constants(material, wavelength) for wavelength in wavelengths_nm]
     medium, k_range_nm = read(path)
+    return [_at(path, medium, k_range_nm, float(wavelength)) for wavelength in wavelengths_nm]
+
+
+def _at(path: Path, medium: Medium, k_range_nm: tuple[float, float], wavelength_nm: float) -> OpticalConstants:
     shortest, longest = medium.range_nm
     if not shortest <= wavelength_nm <= longest:
         raise UsageError(f"{path}: the wavelength must be {shortest:g} to {longest:g} nm, not {wavelength_nm:.10g}")
@@ -47,7 +56,7 @@ def constants_of(material: str, wavelength_nm: float) -> OpticalConstants:
     k = medium.k(wavelength_nm) if medium.k is not None and known else None
     if k is not None and not 0.0 <= k <= INDEX[1]:
         raise TSDFError(f"{path}: k is {k:g} at {wavelength_nm:g} nm; it must be 0 to {INDEX[1]:g}")
-    return OpticalConstants(n, k, float(wavelength_nm), _line(path.name), medium.source)
+    return OpticalConstants(n, k, wavelength_nm, _line(path.name), medium.source)
 
 
 def read(path: Path) -> tuple[Medium, tuple[float, float]]:

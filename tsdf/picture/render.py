@@ -20,6 +20,7 @@ import numpy as np
 
 from tsdf.errors import SceneError, UsageError
 from tsdf.handle import Handle
+from tsdf.picture.trust import Moments, Trust, kurtosis_of
 from tsdf.picture.world import World, camera_of, sees
 from tsdf.scene.levels import LEVELS
 from tsdf.walk import packed
@@ -60,6 +61,8 @@ class Picture:
         Whether it is less than what was asked for because the user stopped it.
     leapt, leaps : int
         How many of the events were not drawn one by one, and how many leaps stand for them.
+    trust : Trust, optional
+        Whether its variance is to be believed; None where there is no variance, or nobody has looked.
     """
 
     rgb: np.ndarray
@@ -73,6 +76,7 @@ class Picture:
     interrupted: bool
     leapt: int = 0
     leaps: int = 0
+    trust: Trust | None = None
 
     @property
     def relative_error(self) -> float:
@@ -241,7 +245,8 @@ def measure(
     goal = Goal(spp, seconds, target_error)
     threads = threads or os.cpu_count() or 1
     stop, halt = stop or threading.Event(), threading.Event()
-    sums, count = Sums(width, height), width * height
+    met = world.media.traits.packed and bool(world.scene.media) and world.lights.sampled  # by chance alone
+    sums, count = Sums(width, height, kurtosis_of(world.lights) if met else 0.0), width * height
     pool = [Walkers(world) for _ in range(threads)]
     pool[0].follow(T.Job(camera, 0, 1, 0, seed), 1, halt)  # compiles, outside the time
     for walkers in pool:
@@ -339,12 +344,16 @@ class Sums:
     total, squares : (h * w, 3) float64
         Of radiance, and of its square.
     samples : (h * w,) int64
+    moments : Moments
+    kurtosis : float
+        Of the lights that are met by chance alone, see `trust.kurtosis_of`; 0 where there are none.
     """
 
-    def __init__(self, width: int, height: int) -> None:
+    def __init__(self, width: int, height: int, kurtosis: float = 0.0) -> None:
         self.shape = (height, width, 3)
         self.total, self.squares = np.zeros((width * height, 3)), np.zeros((width * height, 3))
         self.samples = np.zeros(width * height, np.int64)
+        self.moments, self.kurtosis = Moments(width * height), kurtosis
 
     @property
     def black(self) -> bool:
@@ -356,6 +365,7 @@ class Sums:
         own = slice(block.pixel, block.pixel + block.pixels)
         self.total[own] += radiance.sum(axis=1)
         self.squares[own] += (radiance**2).sum(axis=1)
+        self.moments.add(own, self.samples[own], radiance)
         self.samples[own] += block.number
 
     def picture(self, counters: np.ndarray, seconds: float, interrupted: bool) -> Picture:
@@ -376,6 +386,7 @@ class Sums:
             leaps=int(counters[W.LEAPS]),
             faults=int(counters[W.FAULTS]),
             interrupted=interrupted,
+            trust=self.moments.trust(self.samples, self.shape[:2], self.kurtosis) if self.samples.max() > 1 else None,
         )
 
 

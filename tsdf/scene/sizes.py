@@ -228,7 +228,7 @@ def convert(
     fraction = said[amount]
     if amount == "packing_fraction":
         if not fraction <= MAX_PACKING_FRACTION:
-            raise UsageError(f"packing_fraction must be at most {MAX_PACKING_FRACTION:g}, not {fraction:g}")
+            raise UsageError(f"the packing fraction must be at most {MAX_PACKING_FRACTION:g}, not {fraction:g}")
         return InWords(sizes, fraction, radius, metres_per_unit)
     solid = fraction
     if amount == "density":

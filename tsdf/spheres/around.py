@@ -66,7 +66,7 @@ def around_of(packing: Packing | None) -> Around:
 @njit(forceinline=True, **KERNEL)
 def nearest(around, sphere, n, d):
     """Return block and lane, as one number, of the sphere that light meets first which leaves a sphere along d where
-    its outward normal is n, and about how far that is; -1 if what it meets is farther than those around it reach."""
+    the normal is n, and about how far that is; -1 if what it meets is farther than those around it reach."""
     nx, ny, nz = np.float32(n[0]), np.float32(n[1]), np.float32(n[2])
     dx, dy, dz = np.float32(d[0]), np.float32(d[1]), np.float32(d[2])
     one, none = np.float32(1.0), np.float32(0.0)

@@ -92,35 +92,41 @@ class Passed(NamedTuple):
 # ----------------------------------------------------------------------------------------------- paths
 
 
-def _batch(world: World, camera: T.Camera, first: int, paths: int, seed: int, marks: int) -> tuple[np.ndarray, Ends]:
-    """Follow paths to their end, or past their limit of events so often; return as `follow` does."""
+def trips(
+    world: World, camera: T.Camera, first: int, paths: int, seed: int,
+    heard: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+    aim: Callable[[np.ndarray], None] = lambda new: None,
+) -> tuple[int, int, float]:  # fmt: skip
+    """Follow paths of a camera's first pixel, and tell of each whenever it has met as many grains as the world's limit
+    says, and when it ends; return grains met, what was drawn for that (single events and leaps), processor time [s].
+
+    Parameters
+    ----------
+    first : int
+        Number of the first path; paths of another number have other random numbers.
+    heard : callable
+        Given walkers, their amounts, and which of them could go on (n,) bool, it returns which of them do. `sample` is
+        a walker's number from `first` on.
+    aim : callable
+        May turn walkers that are about to start.
+    """
     mine = Walkers(world)
     began = time.thread_time()
     mine.reserve(paths)
-    job = T.Job(camera, 0, first + paths, 0, seed)
-    places = np.zeros((paths, marks, 3))
-    start, place, way = (np.zeros((paths, 3)) for _ in range(3))
-    weight, amounts = np.zeros(paths), np.zeros((paths, world.amounts))
-    passed = np.zeros(paths, np.int64)
+    job = T.Job(camera, 0, paths, first, seed)
     spawned, live = 0, 0
     while live or spawned < paths:
         if live <= SLOTS // 2 and spawned < paths:
             fresh = min(SLOTS - live, paths - spawned)
-            new = mine.walkers[0][live : live + fresh]
-            mine.spawn(live, job, first + spawned, fresh)
-            new["sample"] -= first
-            start[new["sample"]] = new["p"]
+            mine.spawn(live, job, spawned, fresh)
+            aim(mine.walkers[0][live : live + fresh])
             spawned, live = spawned + fresh, live + fresh
         before = live
         live = mine.turn(live)
         gone = np.flatnonzero(mine.walkers[1][:before]["sample"] < 0)
         those = mine.walkers[1][gone].copy()
-        number = ~those["sample"]
-        those["sample"] = number
-        places[number, passed[number]] = place[number] = those["p"]
-        way[number], weight[number], amounts[number] = those["d"], those["weight"], mine.amounts[1][gone]
-        passed[number] += 1
-        again = (passed[number] < marks) & (those["events"] >= world.media.limit) & (those["weight"] > 0.0)
+        those["sample"] = ~those["sample"]
+        again = heard(those, mine.amounts[1][gone], (those["events"] >= world.media.limit) & (those["weight"] > 0.0))
         more = int(again.sum())
         if more:
             those["events"], those["ray"] = 0, W.NONE
@@ -128,7 +134,27 @@ def _batch(world: World, camera: T.Camera, first: int, paths: int, seed: int, ma
             mine.amounts[0][live : live + more] = mine.amounts[1][gone][again]
             live += more
     events, seconds = int(mine.counters[W.EVENTS]), time.thread_time() - began
-    drawn = events - int(mine.counters[W.LEAPT]) + int(mine.counters[W.LEAPS])
+    return events, events - int(mine.counters[W.LEAPT]) + int(mine.counters[W.LEAPS]), seconds
+
+
+def _batch(world: World, camera: T.Camera, first: int, paths: int, seed: int, marks: int) -> tuple[np.ndarray, Ends]:
+    """Follow paths to their end, or past their limit of events so often; return as `follow` does."""
+    places = np.zeros((paths, marks, 3))
+    start, place, way = (np.zeros((paths, 3)) for _ in range(3))
+    weight, amounts = np.zeros(paths), np.zeros((paths, world.amounts))
+    passed = np.zeros(paths, np.int64)
+
+    def begin(new: np.ndarray) -> None:
+        start[new["sample"]] = new["p"]
+
+    def heard(those: np.ndarray, crossed: np.ndarray, able: np.ndarray) -> np.ndarray:
+        number = those["sample"]
+        places[number, passed[number]] = place[number] = those["p"]
+        way[number], weight[number], amounts[number] = those["d"], those["weight"], crossed
+        passed[number] += 1
+        return able & (passed[number] < marks)
+
+    events, drawn, seconds = trips(world, camera, first, paths, seed, heard, begin)
     return places, Ends(start, place, way, weight, amounts, events, drawn, seconds)
 
 

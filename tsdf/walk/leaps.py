@@ -61,6 +61,25 @@ def missing(leaps, m, bound):
     return leaps.size[m, ROOM] + leaps.size[m, MARGIN] - bound
 
 
+@njit(forceinline=True, **KERNEL)
+def tilted(n, side, cosine):
+    """Return the unit vector at an angle of given cosine from n toward the side, and the side from there toward n."""
+    sine = math.sqrt(max(0.0, 1.0 - cosine * cosine))
+    return (
+        step((cosine * n[0], cosine * n[1], cosine * n[2]), sine, side),
+        step((sine * n[0], sine * n[1], sine * n[2]), -cosine, side),
+    )
+
+
+@njit(forceinline=True, **KERNEL)
+def around(n, side, turns, mirrored):
+    """Return a side of n turned about it, or the other way."""
+    co, si = turned(turns)
+    if mirrored:
+        si = -si
+    return step((co * side[0], co * side[1], co * side[2]), si, cross(n, side))
+
+
 @njit(**KERNEL)
 def leap(world, batch, w, amounts):
     """Take a walker that enters a sphere, or meets a point, out of the largest ball that there is room for.
@@ -89,36 +108,27 @@ def leap(world, batch, w, amounts):
     u0, u1 = halves(mix(key))
     key += GOLDEN
     u2, u3 = halves(mix(key))
-    key += GOLDEN
-    u4, u5 = halves(mix(key))
     if k < last and u2 * (balls[m, k + 1, 0] - balls[m, k, 0]) < square - balls[m, k, 0]:
         k += 1
     i = int(u3 * leaps.kept[m])
     record, unit = leaps.records[m, k, i], leaps.size[m, UNIT]
     times = balls[m, k, 3] * (square + 2.0 * balls[m, k, 1] * r + balls[m, k, 2])
 
-    z = 1.0 - 2.0 * u0
-    co, si = turned(u1)
-    rho = math.sqrt(max(0.0, 1.0 - z * z))
-    u = (rho * co, rho * si, z)
-    side, up = frame(u)
-    co, si = turned(u4)
-    side = step((co * side[0], co * side[1], co * side[2]), si, up)
-    mu = float(record[1])
-    sine = math.sqrt(max(0.0, 1.0 - mu * mu))
-    d = step((mu * u[0], mu * u[1], mu * u[2]), sine, side)
+    # u, where the ball is left, about d as far as the record's; the new direction about u, the next side about it
+    first, second = frame(d)
+    co, si = turned(u0)
+    side = step((co * first[0], co * first[1], co * first[2]), si, second)
+    nu, mu, mirrored = float(record[1]), float(record[2]), u1 < 0.5  # the mirror image is as likely
+    u, inward = tilted(d, side, nu)
+    side = around(u, inward, float(record[3]), mirrored)
+    d, inward = tilted(u, side, mu)
     write(w.p, step(middle, r - unit * float(record[0]), u))
     write(w.d, d)
-    w.free = unit * float(record[5])
+    w.free = unit * float(record[6])
     if remembers:
-        inward = step((sine * u[0], sine * u[1], sine * u[2]), -mu, side)
-        si = float(record[3])
-        if u5 < 0.5:  # the mirror image is as likely
-            si = -si
-        co = float(record[2])
-        write(w.t, step((co * inward[0], co * inward[1], co * inward[2]), si, cross(d, inward)))
-        w.b = float(record[4])
-    met = float(record[6])
+        write(w.t, around(d, inward, float(record[4]), mirrored))
+        w.b = float(record[5])
+    met = float(record[7])
     if met > 0.0:
         w.pdf = -1.0  # nobody has aimed at a light where this direction was drawn: what it finds counts in full
     count_of(world, batch, w, amounts, leaps.crossed[m, k, i], (times, met * times, key))

@@ -45,7 +45,7 @@ FEWEST = 512  # where light hardly turns, and a record takes very many events
 BUDGET = 3e7  # events that making records may take, unless there would be fewer than that
 DRAWS = 1 << 20  # of deflections, for their means
 BATCHES = 16  # of these draws: the errors are what they differ by
-COLUMNS = 7  # of a record: depth, mu, cosine and sine of psi, b, pending flight, events
+DEPTH, NU, MU, CHI, PSI, B, FLIGHT, GRAINS = range(8)  # columns of records: see `Passage`
 
 
 class Chain(NamedTuple):
@@ -71,9 +71,11 @@ class Passage:
     numbers : (classes, 4) float64
         A and B of reff^2 = r^2 + 2 A r + B = step2 E[N]; what the mean N of the records was over that, which they have
         been corrected for, and its standard error.
-    records : (classes, n, 7) float32
-        Depth below the ball's surface of where the last grain was left, cosine between the direction and the way out,
-        cosine and sine of the azimuth of the next entry's side, its impact parameter, the pending flight, N.
+    records : (classes, n, 8) float32
+        Where and whither the last grain was left: depth below the ball's surface; cosine nu between the way there from
+        the middle, u, and the direction at the start, d_0; cosine mu between u and the direction d now; azimuth chi of d
+        about u, from d_0 [turns]. What is entered next: azimuth psi of its side about d, from u [turns]; its impact
+        parameter; the flight there, still pending. And N.
     crossed : (classes, n, components + 1) float32
         Path length in the matter of each component [R], events where it has none; and the length flown.
     """
@@ -119,21 +121,24 @@ def drawn(chain, m, first, last, seed, sums):
 
 
 @njit(forceinline=True, **KERNEL)
+def azimuth(n, a, b):
+    """Return the angle from a to b about the unit vector n, in [0, 1) turns; 0 where there is none."""
+    a, b = step(a, -dot(a, n), n), step(b, -dot(b, n), n)
+    turns = math.atan2(dot(cross(a, b), n), dot(a, b)) / (2.0 * math.pi)
+    return turns - math.floor(turns)
+
+
+@njit(forceinline=True, **KERNEL)
 def ended(out, c, p, d, rest):
-    """Write a record: p and d are where and whither the last grain was left, `rest` is (t, b, pending flight, N,
-    radius)."""
+    """Write a record: p and d are where and whither the last grain was left, the direction at the start is along z, and
+    `rest` is (t, b, pending flight, N, radius)."""
     t, b, s, n, radius = rest
-    out[4], out[5], out[6] = b, s, n
     q = step(p, -1.0, c)
     far = math.sqrt(dot(q, q))
     u = (q[0] / far, q[1] / far, q[2] / far) if far > 0.0 else d
-    mu = min(max(dot(u, d), -1.0), 1.0)
-    out[0], out[1], out[2], out[3] = radius - far, mu, 1.0, 0.0
-    side = step(u, -mu, d)
-    size = math.sqrt(dot(side, side))
-    if size > 1e-9:
-        side = (side[0] / size, side[1] / size, side[2] / size)
-        out[2], out[3] = dot(side, t), dot(cross(d, side), t)
+    out[DEPTH], out[NU], out[MU] = radius - far, u[2], min(max(dot(u, d), -1.0), 1.0)
+    out[CHI], out[PSI] = azimuth(u, (0.0, 0.0, 1.0), d), azimuth(d, u, t)
+    out[B], out[FLIGHT], out[GRAINS] = b, s, n
 
 
 @njit(**KERNEL)
@@ -332,15 +337,29 @@ def _of_memory(memory: M.Memory, m: int, first: int, kinds: int) -> Means:
 
 
 def _numbers(records: np.ndarray, radius: float, means: Means) -> list[float]:
-    """Return a row of `Passage.numbers`."""
+    """Return a row of `Passage.numbers`, and correct records by what is known exactly: M is in the middle in the mean,
+    and the mean of its square tells that of N."""
     ahead, aside = means.ahead, means.aside
-    depth, mu, cos_psi, _, b, s, n = records.astype(np.float64).T
+    depth, nu, mu, chi, psi, b, s, n = records.T
     cell = np.minimum((b * b * len(ahead)).astype(np.int64), len(ahead) - 1)
-    along, across = s + ahead[cell], aside[cell]
-    out = along * mu + across * cos_psi * np.sqrt(np.maximum(0.0, 1.0 - mu * mu))  # of M, from the last exit
+    along, across, sine = s + ahead[cell], aside[cell], np.sqrt(np.maximum(0.0, 1.0 - mu * mu))
+    (co_chi, si_chi), (co_psi, si_psi) = ((np.cos(2.0 * np.pi * x), np.sin(2.0 * np.pi * x)) for x in (chi, psi))
+    out = along * mu + across * co_psi * sine  # of M, from the last exit, along u
+    beside = along * sine * co_chi + across * (si_psi * si_chi - co_psi * mu * co_chi)  # and across, toward d_0
+
+    def turned(by: float) -> np.ndarray:
+        return np.asarray(np.clip(nu + by * (1.0 - nu * nu), -1.0, 1.0))
+
+    by = 0.0
+    for _ in range(4):
+        new = turned(by)
+        off = ((radius - depth + out) * new + beside * np.sqrt(1.0 - new * new)).mean()
+        by -= off / ((radius - depth + out) * (1.0 - nu * nu)).mean()
+    records[:, NU] = turned(by)
     square = depth**2 - 2.0 * depth * out + along**2 + across**2
     a, b2 = float((out - depth).mean()), float(square.mean())
     each = n * (means.step2 / (radius * radius + 2.0 * a * radius + b2))
+    records[:, GRAINS] /= each.mean()
     return [a, b2, float(each.mean()), float(each.std()) / math.sqrt(len(n))]
 
 
@@ -374,7 +393,7 @@ def made(
         radius = max(turn, LEAST_RADIUS * scale) * 2.0 ** (0.5 * np.arange(CLASSES))
         events = float(((radius + turn) ** 2).sum() / means.step2)
         count = int(min(RECORDS, max(FEWEST, BUDGET / events)))
-        records = np.zeros((CLASSES, count, COLUMNS))
+        records = np.zeros((CLASSES, count, GRAINS + 1))
         crossed = np.zeros((CLASSES, count, kinds + 1))
         parts = 8
         jobs = [
@@ -396,7 +415,6 @@ def made(
             if progress is not None:
                 progress(done / total)
     numbers = np.array([_numbers(one, r, means) for one, r in zip(records, radius, strict=True)])
-    records[:, :, -1] /= numbers[:, None, 2]
     crossed /= numbers[:, None, None, 2]
     return Passage(
         means.ahead, means.aside, means.step2, turn, radius, numbers, records.astype(np.float32),
@@ -444,7 +462,7 @@ def kept(
 def _read(path: Path, digest: str, kinds: int) -> Passage | None:
     """Return records that are kept, None where they are not or are not whole."""
     try:
-        arrays = archive.read(path, 64 * CLASSES * RECORDS * (COLUMNS + kinds + 1) + (1 << 20))
+        arrays = archive.read(path, 64 * CLASSES * RECORDS * (GRAINS + kinds + 2) + (1 << 20))
         label, means = str(arrays.pop("digest")), arrays.pop("means")
         step2, turn = (float(x) for x in means)
         found = Passage(step2=step2, turn=turn, **arrays)
@@ -453,7 +471,7 @@ def _read(path: Path, digest: str, kinds: int) -> Passage | None:
     shape = found.records.shape
     right = (
         label == digest
-        and shape == (CLASSES, shape[1], COLUMNS)
+        and shape == (CLASSES, shape[1], GRAINS + 1)
         and found.crossed.shape == (CLASSES, shape[1], kinds + 1)
         and found.numbers.shape == (CLASSES, 4)
         and found.radius.shape == (CLASSES,)

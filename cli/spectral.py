@@ -1,0 +1,229 @@
+"""What commands about spectra share: a grain or its tables, how large it is, wavelengths, and columns of numbers."""
+
+import csv
+import io
+import json
+import math
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import click
+
+from tsdf.cli.absorption import METRES
+from tsdf.cli.common import check_output, plain, say, whole_number
+from tsdf.errors import UsageError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from tsdf.study.spectra import Family, Spectrum
+
+SUFFIX = ".exr"  # of tables; all else is a grain
+DEFAULT_SIZE = ("effective_radius", 2e-4)  # [m] where nothing is said: old snow
+TABLE_PATHS = 2_000_000  # of each table that is made
+LENGTHS = ("radius", "effective_radius", "volume_radius", "maximum_dimension", "sieve")
+Command = Callable[..., Any]
+
+
+def metres(context: click.Context, parameter: click.Parameter, value: str | None) -> float | None:
+    """Read a length, "0.2mm" say; without a unit it is in metres."""
+    if value is None:
+        return None
+    found = re.fullmatch(r"\s*([-+.0-9eE]+)\s*([a-z]*)\s*", value)
+    try:
+        if found is None or found[2] not in ("", *METRES):
+            raise ValueError
+        length = float(found[1]) * METRES.get(found[2], 1.0)
+    except ValueError:
+        length = math.nan
+    if not 0.0 < length < math.inf:
+        raise click.BadParameter(f"{value!r} is not a length, 0.2mm say ({', '.join(METRES)})", context, parameter)
+    return length
+
+
+def _setting(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
+    pairs = [value.partition("=") for value in values]
+    if any(not name or not equals for name, equals, _ in pairs) or len({name for name, _, _ in pairs}) < len(pairs):
+        raise click.BadParameter("give NAME=VALUE, each name once", context, parameter)
+    return {name: number for name, _, number in pairs}
+
+
+def options(command: Command) -> Command:
+    """Add the arguments and options that say which grains, how large, of what and at which wavelengths."""
+    for add in reversed(
+        (
+            click.argument("grains", nargs=-1, required=True, metavar="GRAIN|TABLE.."),
+            click.option("--material", default="ice", show_default=True, metavar="NAME|FILE",
+                         help="As of tsdf-build: ice, water, quartz, salt, glass, sucrose, or your own constants."),
+            click.option("--wavelength-nm", default="300:2500:10", show_default=True, metavar="FROM:TO:STEP|A,B,..",
+                         help="Wavelengths [nm], ends included."),
+            click.option("--radius", callback=metres, metavar="LENGTH", help="Bounding radius R, 0.5mm say."),
+            click.option("--effective-radius", callback=metres, metavar="LENGTH",
+                         help="3 V / (4 projected area).  [default: 0.2mm]"),
+            click.option("--volume-radius", callback=metres, metavar="LENGTH", help="Of the sphere of equal volume."),
+            click.option("--maximum-dimension", callback=metres, metavar="LENGTH", help="Between any two points."),
+            click.option("--sieve", callback=metres, metavar="LENGTH", help="Mesh width that grains just pass."),
+            click.option("--ssa", type=float, metavar="X", help="Specific surface area [m2/kg]."),
+            click.option("--set", "settings", multiple=True, callback=_setting, metavar="NAME=VALUE",
+                         help="A parameter of a built-in grain; tsdf-build --grains lists them."),
+            click.option("--table-paths", callback=whole_number, default=f"{TABLE_PATHS:g}", show_default=True,
+                         metavar="N", help="Paths of each table that is made of a GRAIN."),
+            click.option("--threads", callback=whole_number, metavar="N", help="[default: all processors]"),
+            click.option("--json", "as_json", is_flag=True, help="Print one JSON object."),
+            click.option("--csv", "csv_file", type=click.Path(path_type=Path), metavar="PATH", help="Write columns."),
+            click.option("--plot", type=click.Path(path_type=Path), metavar="PATH", help="Draw it, .png or .pdf."),
+            click.option("--quiet", is_flag=True, help="No progress bar, no table."),
+        )
+    ):  # fmt: skip
+        command = add(command)
+    return command
+
+
+class Asked(NamedTuple):
+    """Options of `options`, but for those about output."""
+
+    grains: tuple[str, ...]
+    material: str
+    wavelength_nm: str
+    sizes: Mapping[str, float]
+    settings: Mapping[str, str]
+    table_paths: int
+    threads: int
+
+    @classmethod
+    def of(cls, grains: tuple[str, ...], said: Mapping[str, Any]) -> "Asked":
+        """Return them as a command was given them.
+
+        Raises
+        ------
+        UsageError
+        """
+        sizes = {name: float(said[name]) for name in (*LENGTHS, "ssa") if said[name] is not None}
+        if len(sizes) > 1:
+            words = " and ".join("--" + name.replace("_", "-") for name in sizes)
+            raise UsageError(f"{words} each say how large the grains are: give one")
+        tables = [grain.lower().endswith(SUFFIX) for grain in grains]
+        if any(tables) and not all(tables):
+            raise UsageError("give one GRAIN, or tables of one grain (NAME.tsdf.exr), not both")
+        if not any(tables) and len(grains) > 1:
+            raise UsageError("give one GRAIN, or tables of one grain (NAME.tsdf.exr) at several indices")
+        if any(tables) and said["settings"]:
+            raise UsageError("--set shapes a GRAIN that is built, not one whose tables are given")
+        threads = said["threads"] or os.cpu_count() or 1
+        return cls(grains, said["material"], said["wavelength_nm"], sizes or dict([DEFAULT_SIZE]), said["settings"],
+                   said["table_paths"], threads)  # fmt: skip
+
+    @property
+    def mesh(self) -> Path | None:
+        """The file of a grain that is not built in, None where a table or a built-in grain is given."""
+        path = Path(self.grains[0])
+        return path if not self.grains[0].lower().endswith(SUFFIX) and path.is_file() else None
+
+    @property
+    def inputs(self) -> list[Path]:
+        """All that is read."""
+        return [Path(name) for name in (*self.grains, self.material)]
+
+    def scattering(
+        self, told: Callable[[float, str], None], seed: int = 0, **records: int
+    ) -> tuple["Family", "Spectrum", str]:
+        """Return tables, what their grains do to light by wavelength, and their size in all words.
+
+        Raises
+        ------
+        UsageError, TSDFError
+        """
+        from tsdf.data import format
+        from tsdf.grain.constants import constants_over
+        from tsdf.grain.grains import load_grain
+        from tsdf.make.scatterometer import Effort
+        from tsdf.scene.sizes import DENSITIES, convert
+        from tsdf.study import spectra
+
+        constants = spectra.Constants.of(constants_over(self.material, spectra.wavelengths(self.wavelength_nm)))
+        if self.grains[0].lower().endswith(SUFFIX):
+            family = spectra.Family.of([format.read(Path(name)) for name in self.grains])
+        else:
+            grain = load_grain(self.grains[0], False, **self.settings)
+            paths = None if grain.kind == "sphere" else self.table_paths
+            effort = Effort(paths, seed=seed, **records)
+            family = spectra.build(grain, constants.n, effort, threads=self.threads, told=told)
+        said = {**self.sizes, "packing_fraction": 0.5}
+        if self.material in DENSITIES:
+            said["material_density"] = DENSITIES[self.material]
+        packed = convert([(family.tables[0], 1.0)], said, metres_per_unit=1.0)
+        words = {"radius": "R {:.4g} m", "effective_radius": "effective radius {:.4g} m", "ssa": "SSA {:.4g} m2/kg"}
+        facts = packed.facts()
+        size = ", ".join(form.format(facts[name]) for name, form in words.items() if facts[name] is not None)
+        if self.sizes == dict([DEFAULT_SIZE]):
+            size += " (by default)"
+        return family, spectra.spectrum(family, constants, packed.radius), size
+
+
+def packing_of(family: "Family", material: str, density: float) -> float:
+    """Return the packing fraction at which the medium has a density [kg/m^3].
+
+    Raises
+    ------
+    UsageError
+    """
+    from tsdf.scene.sizes import DENSITIES, convert
+
+    said = {"density": density} | ({"material_density": DENSITIES[material]} if material in DENSITIES else {})
+    return convert([(family.tables[0], 1.0)], said).packing_fraction
+
+
+def check(asked: Asked, *outputs: Path | None) -> None:
+    """Refuse outputs that cannot be written, and pictures of no known kind, before any work is done."""
+    written = [path for path in outputs if path is not None]
+    if written:
+        check_output(written[0], *asked.inputs, beside=written[1:])
+
+
+Columns = Mapping[str, "np.ndarray"]
+
+
+def number(value: float) -> float | None:
+    """Return a number for JSON, None for what is not known."""
+    return float(value) if math.isfinite(value) else None
+
+
+def csv_text(columns: Columns, notes: Sequence[str]) -> str:
+    """Return columns as CSV under comments."""
+    text = io.StringIO()
+    text.writelines(f"# {note}\n" for note in notes)
+    sheet = csv.writer(text, lineterminator="\n")
+    sheet.writerow(columns)
+    for row in zip(*columns.values(), strict=True):
+        sheet.writerow(["" if number(value) is None else f"{value:.8g}" for value in row])
+    return text.getvalue()
+
+
+def text_table(columns: Columns, notes: Sequence[str]) -> str:
+    """Return columns for people, under comments."""
+    lines = [f"# {note}" for note in notes]
+    width = {name: max(len(name), 10) for name in columns}
+    lines.append(" ".join(name.rjust(width[name]) for name in columns))
+    for row in zip(*columns.values(), strict=True):
+        cells = ("-" if number(value) is None else f"{value:.5g}" for value in row)
+        lines.append(" ".join(cell.rjust(width[name]) for name, cell in zip(columns, cells, strict=True)))
+    return "\n".join(lines)
+
+
+def tell(
+    columns: Columns, facts: Mapping[str, Any], notes: Sequence[str], as_json: bool, csv_file: Path | None, quiet: bool
+) -> None:
+    """Print columns as JSON or for people, and write them as CSV where that is asked for."""
+    from tsdf.files import replacing
+
+    if csv_file is not None:
+        with replacing(csv_file) as temporary:
+            temporary.write_text(csv_text(columns, notes), encoding="utf-8")
+    if as_json:
+        values = {name: [number(value) for value in column] for name, column in columns.items()}
+        click.echo(json.dumps({**facts, "notes": [plain(note) for note in notes], **values}))
+    elif not quiet:
+        say(text_table(columns, [plain(note) for note in notes]))
