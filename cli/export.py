@@ -12,6 +12,26 @@ SPECTRAL = ("tartes", "snicar", "disort", "eradiate", "phase")  # `radiative` wr
 TARGETS = ("pbrt", "blender", "openpbr", "materialx", "arnold", "karma", "csv", "npz", *SPECTRAL)
 
 
+def _check_numbers(
+    words: dict[str, float], unit: float | None, kept: float, thickness: float | None, colour_thickness: float | None
+) -> None:
+    """Refuse what no medium can have."""
+    from tsdf.errors import UsageError
+    from tsdf.scene.sizes import SIZES
+
+    if not 0.0 < kept < 1.0:
+        raise UsageError(f"--kept is a share > 0 and < 1, not {kept:g}")
+    if thickness is not None and not thickness > 0.0:
+        raise UsageError(f"--thickness is a number > 0, not {thickness:g}")
+    if not any(word in words for word in SIZES):
+        raise UsageError("say how large grains are: give one of --radius, --effective-radius, --sieve, ... (--help)")
+    for name, value in (("--unit", unit), ("--colour-thickness", colour_thickness)):
+        if value is not None and not 0.0 < value < math.inf:
+            raise UsageError(f"{name} is a finite number > 0, not {value:g}")
+    if not 1e-30 <= words.get("radius", 1.0) <= 1e30:
+        raise UsageError(f"--radius is a number of scene units from 1e-30 to 1e30, not {words['radius']:g}")
+
+
 @click.command("tsdf-export", cls=Tool)
 @click.argument("files", nargs=-1, required=True, metavar="FILE..")
 @click.option("--to", required=True, type=click.Choice(TARGETS), help="What to write for.")
@@ -77,16 +97,13 @@ def main(  # noqa: PLR0913 - an argument for each option
     file = files[0]
     from tsdf.cli.absorption import conventions, times_radius
     from tsdf.errors import UsageError
-    from tsdf.scene.sizes import SIZES
 
     words, colour = said(options), colour_of(deep_colour)
-    _check_numbers(kept, thickness, unit, colour_thickness, words.get("radius"))
+    _check_numbers(words, unit=unit, kept=kept, thickness=thickness, colour_thickness=colour_thickness)
     if sum(given is not None for given in (absorption, material, deep_colour)) > 1:
         raise UsageError("--absorption, --material and --deep-colour all say how grains absorb: give one")
     if material is not None and unit is None:
         raise UsageError(f"absorption of {plain(material)} is per metre: say with --unit how long the scene unit is")
-    if not any(word in words for word in SIZES):
-        raise UsageError("say how large grains are: give one of --radius, --effective-radius, --sieve, ... (--help)")
     if to == "npz" and out is None:
         raise UsageError("npz is no text: say with --out where to write it")
     if out is not None:
@@ -128,20 +145,3 @@ def main(  # noqa: PLR0913 - an argument for each option
         click.echo(text, nl=False)
         return
     write_text(out, text)
-
-
-def _check_numbers(
-    kept: float, thickness: float | None, unit: float | None, colour_thickness: float | None, radius: float | None
-) -> None:
-    """Refuse numbers that are out of range; None is not given."""
-    from tsdf.errors import UsageError
-
-    if not 0.0 < kept < 1.0:
-        raise UsageError(f"--kept is a share > 0 and < 1, not {kept:g}")
-    if thickness is not None and not thickness > 0.0:
-        raise UsageError(f"--thickness is a number > 0, not {thickness:g}")
-    for name, value in (("--unit", unit), ("--colour-thickness", colour_thickness)):
-        if value is not None and not 0.0 < value < math.inf:
-            raise UsageError(f"{name} is a finite number > 0, not {value:g}")
-    if radius is not None and not 1e-30 <= radius <= 1e30:
-        raise UsageError(f"--radius is a number of scene units from 1e-30 to 1e30, not {radius:g}")
