@@ -10,7 +10,8 @@ from tsdf.data.table import Table
 from tsdf.errors import UsageError
 from tsdf.picture import image
 from tsdf.scene.medium import Component, VolumeParameters, volume_parameters
-from tsdf.scene.scene import Absorption, absorption_at
+from tsdf.scene.scene import Absorption
+from tsdf.scene.specs import absorption_at
 from tsdf.walk.lights import LUMINANCE
 
 ENOUGH = 0.02  # [1] total variation up to which one lobe is taken where a target could mix two

@@ -35,7 +35,8 @@ from tsdf.make.scatterometer import Effort
 from tsdf.picture import image
 from tsdf.reference_data.make_checks import CHECKS
 from tsdf.scene.medium import Component, volume_parameters
-from tsdf.scene.scene import Absorption, absorption_at
+from tsdf.scene.scene import Absorption
+from tsdf.scene.specs import absorption_at
 
 CUBE = CHECKS / "cube.tsdf.exr"
 SIGMAS = 4.0
