@@ -149,13 +149,13 @@ class Asked(NamedTuple):
         ------
         UsageError, TSDFError
         """
-        from tsdf.data import format
+        from tsdf.data import format as tsdf_format
         from tsdf.grain.grains import load_grain
         from tsdf.make.scatterometer import Effort
         from tsdf.study import spectra
 
         if self.tabulated:
-            return spectra.Family.of([format.read(Path(name)) for name in self.grains])
+            return spectra.Family.of([tsdf_format.read(Path(name)) for name in self.grains])
         assert constants is not None
         grain = load_grain(self.grains[0], False, **self.settings)
         paths = None if grain.kind == "sphere" else self.table_paths

@@ -28,7 +28,7 @@ from tsdf.scene.scene import Absorption, GrainSpec, Slab
 from tsdf.study import streams
 from tsdf.study.experiment import WIDE, scene_of, trips
 from tsdf.study.spectra import Family, Spectrum, absorbed, lagrange
-from tsdf.walk import transport as T
+from tsdf.walk import transport
 
 GROUPS = 32  # of paths, whose spread tells the error
 CHUNK = 4096  # paths that one thread follows at a time
@@ -292,7 +292,7 @@ class Paths:
         """Height of the slab's upper side, relative to the scene's centre."""
         return -float(self.world.place.centre[2])
 
-    def camera(self) -> T.Camera:
+    def camera(self) -> transport.Camera:
         """Return the beam, or what `_diffuse` turns into diffuse light."""
         cosine = 1.0 if self.cosine is None else self.cosine
         way = np.array([math.sqrt(1.0 - cosine**2), 0.0, -cosine])
