@@ -74,8 +74,8 @@ class Passage:
     records : (classes, n, 8) float32
         Where and whither the last grain was left: depth below the ball's surface; cosine nu between the way there from
         the middle, u, and the direction at the start, d_0; cosine mu between u and the direction d now; azimuth chi
-        of d about u, from d_0 [turns]. What is entered next: azimuth psi of its side about d, from u [turns]; its impact
-        parameter; the flight there, still pending. And N.
+        of d about u, from d_0 [turns]. What is entered next: azimuth psi of its side about d, from u [turns]; its
+        impact parameter; the flight there, still pending. And N.
     crossed : (classes, n, components + 1) float32
         Path length in the matter of each component [R], events where it has none; and the length flown.
     """
