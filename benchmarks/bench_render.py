@@ -42,8 +42,6 @@ from tsdf.scene.scene import (
     ConstantLight,
     EnvironmentLight,
     GrainSpec,
-    Light,
-    MediumShape,
     MediumSpec,
     Mesh,
     Scene,
@@ -53,6 +51,7 @@ from tsdf.scene.scene import (
     load,
     resized,
 )
+from tsdf.scene.specs import Light, MediumShape
 from tsdf.walk.transport import EVENTS, Job
 
 FRACTION = 0.6

@@ -1,4 +1,4 @@
-"""How large a grain is across: its maximum dimension, and the sieve that it passes.
+"""Extent of a grain: its maximum dimension, and the sieve that it passes.
 
 Both are of the convex hull and in the unit of the vertices. Volume, surface and projected area are elsewhere: `grains`
 has the first two, a table's hit_probability is the third over that of the bounding sphere.

@@ -1,4 +1,4 @@
-"""What stands before a facet: from how low an elevation on light comes and goes unobstructed."""
+"""Horizon map: what stands before a facet, from how low an elevation on light comes and goes unobstructed."""
 
 import math
 from typing import NamedTuple

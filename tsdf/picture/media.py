@@ -16,7 +16,8 @@ from tsdf.picture import image
 from tsdf.scene.levels import Traits
 from tsdf.scene.medium import Component, VolumeParameters, free_path, volume_parameters
 from tsdf.scene.scene import Absorption as AbsorptionSpec
-from tsdf.scene.scene import MediumSpec, Scene, absorption_at
+from tsdf.scene.scene import MediumSpec, Scene
+from tsdf.scene.specs import absorption_at
 from tsdf.walk.lights import LUMINANCE
 from tsdf.walk.walker import Absorption, Media
 
