@@ -23,7 +23,8 @@ from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.picture import render, world
-from tsdf.scene.scene import Box, Camera, ConstantLight, GrainSpec, Light, MediumSpec, Scene, SunLight
+from tsdf.scene.scene import Box, Camera, ConstantLight, GrainSpec, MediumSpec, Scene, SunLight
+from tsdf.scene.specs import Light
 
 PACKING = 0.5
 SIDE = 48  # pixels
