@@ -65,12 +65,12 @@ def main(
     chosen = named_levels(levels, MEASURED)
     check_numbers(seed, threads=threads)
 
-    from tsdf.data import format
+    from tsdf.data import format as tsdf_format
     from tsdf.scene.scene import GrainSpec
     from tsdf.study import accuracy, plots
     from tsdf.walk.explicit import mesh_beside
 
-    read = format.read(table)
+    read = tsdf_format.read(table)
     mesh = mesh or mesh_beside(read, [table.parent])
     meshes = [] if mesh is None else [mesh]
     check_folder(out, ["accuracy.md", "accuracy.csv", "accuracy.png"], table, *meshes)

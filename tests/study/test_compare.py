@@ -143,6 +143,11 @@ def test_every_level_has_a_row(ball: Scene) -> None:
     for row in found.rows:
         assert row.difference is not None
         assert row.variance_time == pytest.approx(row.picture.relative_error**2 * row.picture.seconds)
+    packed = found.rows[1]  # of packings of its own: no error is seen, for what they differ by is in its noise
+    assert packed.samples == found.rows[0].samples and packed.difference is not None
+    assert abs(packed.difference.square) < 4.0 * packed.difference.square_error
+    assert found.rows[-1].difference is not None
+    assert found.rows[-1].difference.square > 4.0 * found.rows[-1].difference.square_error
     lines = list(csv.DictReader(io.StringIO(compare.csv_text(found))))
     assert [line["level"] for line in lines] == list(LEVELS)
     assert float(lines[1]["mean"]) == found.rows[1].mean

@@ -1,4 +1,4 @@
-"""A scene at one level of detail, as the arrays that `transport` follows light through.
+"""World: a scene at one level of detail, as the arrays that `transport` follows light through.
 
 Media become numbers in `media`; how light uses them is `transport`, pictures are `render`. The levels, cheapest first:
 isotropic (point scatterers, similarity), volume-hg (one Henyey-Greenstein lobe), volume (tabulated deflections),
@@ -15,7 +15,7 @@ from typing import assert_never
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.data.sampler import Tables, compile_tables
 from tsdf.data.table import Table
 from tsdf.errors import SceneError, TSDFError, UsageError
@@ -252,7 +252,7 @@ def build(
             return spec.table
         file = os.path.realpath(spec.table)  # each file once, by whatever name
         if file not in read:
-            read[file] = format.read(spec.table)
+            read[file] = tsdf_format.read(spec.table)
         return read[file]
 
     tables = [table_of(grain) for medium in scene.media for grain in medium.grains]
