@@ -56,8 +56,8 @@ class Memory(NamedTuple):
     (c,): records of the light that met it, in the frame (side of the entry, d x side, d): direction, side of the exit,
     impact parameter of the exit, path length.
 
-    For light that is aimed: aimed (all columns of cos theta, AIMED, 8) float32: records of light deflected so, as in
-    `grains`, but for the third number, which is the impact parameter of the entry; met (c,): hit probability.
+    For light that is aimed: aimed (all columns of cos theta, AIMED, 9) float32: records of light deflected so, as in
+    `grains`, and the impact parameter of their entry; met (c,): hit probability.
     """
 
     law: np.ndarray
@@ -199,7 +199,7 @@ def connect(world, batch, w, amounts, p, c, share, bound):
     if not phase > 0.0:
         return
     grain = memory.aimed[column, int(u3 * AIMED)]
-    b = float(grain[2])
+    b = float(grain[8])
     # The side of the entry is the one from which the record's light goes toward the lamp
     side = step(toward, -cosine, d)
     size = math.sqrt(dot(side, side))
@@ -451,13 +451,14 @@ def memory_of(
     kept = [len(table.memory["l"]) for table in tables]
     shape = (len(tables), max(columns, default=1), max(kept, default=1))
     hit, records = np.zeros(shape[:2], np.float32), np.zeros((*shape, 8), np.float32)
-    aimed = [np.zeros((0, AIMED, 8), np.float32)]
+    aimed = [np.zeros((0, AIMED, 9), np.float32)]
     for c, (table, n, k) in enumerate(zip(tables, columns, kept, strict=True)):
         hit[c, :n] = table.hit
         records[c, :n, :k], entered = remembered(table)
         chosen = np.unravel_index(_aimed(table, k), (n, k))
-        aimed.append(records[c, :n, :k][chosen])
-        aimed[-1][..., 2] = entered[chosen]
+        aimed.append(
+            np.concatenate((records[c, :n, :k][chosen], entered[chosen][..., None]), axis=-1, dtype=np.float32)
+        )
     shares = [np.array([share for _, share in some]) for some in grains]
     return Memory(
         law=law,
