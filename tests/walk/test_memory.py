@@ -113,6 +113,21 @@ def test_records_for_aimed_light_are_of_their_column(cube: Table) -> None:
     assert inside[full].all() and full.sum() > 100
 
 
+def test_records_for_aimed_light_are_whole(ball: Table, cube: Table) -> None:
+    """They are records of the table with the entry that these have, so that the shadow's grain is left on its sphere."""
+    for table in (ball, cube):
+        aimed = remembering(0.5, table).aimed
+        records, b = remembered(table)
+        known = {
+            (*record.tolist(), float(np.float32(at))) for record, at in zip(records.reshape(-1, 8), b.flat, strict=True)
+        }
+        assert aimed.shape == (len(table.cos_theta_edges) - 1, memory.AIMED, 9)
+        assert all(tuple(one) in known for one in aimed.reshape(-1, 9).tolist())
+        d, side, out = (aimed[..., i].astype(np.float64) for i in (slice(0, 3), slice(3, 6), slice(6, 7)))
+        normal = out * side + np.sqrt(1.0 - out**2) * d
+        assert np.abs(np.linalg.norm(normal, axis=-1) - 1.0).max() < 1e-6
+
+
 # ---------------------------------------------------------------------------------------------- the packing
 
 
