@@ -5,7 +5,7 @@
 
 One line for each body: grains met in the mean, events drawn without and with leaps, how many times sooner a path ends;
 and then in per cent what leaps change, with the standard error of the difference: of reflectance R, transmittance T, of
-N, the grains met, of all light that comes out if a grain keeps 99.99 % and 99 % of it, and the total variation of the
+all light that comes out if a grain keeps 99.99 % and 99 % of it, of N, the grains met, and the total variation of the
 light that comes back over the distance from the beam, with what noise alone makes of it. Of a ball, R is what leaves
 its near half.
 """
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
 from tsdf.picture.world import beam, build
 from tsdf.scene.scene import Absorption, GrainSpec, Slab, Sphere
@@ -83,10 +83,8 @@ def compared(name: str, table: Table, arguments: Any, size: float, ball: bool) -
     difference = mean[1][bins] / mean[1][bins].sum() - mean[0][bins] / mean[0][bins].sum()
     both = np.hypot(error[0][bins] / mean[0][bins].sum(), error[1][bins] / mean[1][bins].sum())
     variation = 50.0 * np.abs(difference).sum(), 50.0 * math.sqrt(2.0 / math.pi) * both.sum()
-    changes = " ".join(
-        f"{what} {change[k]:+.2f}({noise[k]:.2f})"
-        for what, k in zip(("R", "T", *map(str, KEPT), "N"), (0, 1, 2, 3, -3), strict=True)
-    )
+    places = {"R": 0, "T": 1, f"{KEPT[0]}": 2, f"{KEPT[1]}": 3, "N": -3}
+    changes = " ".join(f"{what} {change[k]:+.2f}({noise[k]:.2f})" for what, k in places.items())
     return (
         f"{name}: N {mean[0][-3]:.4g}, drawn {mean[0][-2]:.4g} -> {mean[1][-2]:.3g}, "
         f"{mean[0][-1] / mean[1][-1]:.2f} times sooner; {changes} profile {variation[0]:.2f} ({variation[1]:.2f})"
@@ -109,7 +107,7 @@ def main() -> None:
         "--seconds", type=float, default=20.0, help="of one thread, for each body without and with leaps"
     )
     arguments = parser.parse_args()
-    table = format.read(arguments.table)
+    table = tsdf_format.read(arguments.table)
     for ball, sizes in ((False, arguments.slab), (True, arguments.ball)):
         for size in sizes:
             name = f"{'ball' if ball else 'slab'} {size:g} R, {arguments.level}, f {arguments.packing:g}"

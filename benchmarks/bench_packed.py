@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.scene.scene import GrainSpec
 from tsdf.study.experiment import block_of, bulk_experiment, gather
 
@@ -55,7 +55,7 @@ def times(grain: GrainSpec, fraction: float) -> dict[str, tuple[float, float]]:
 
 def main() -> None:
     path, seconds = Path(sys.argv[1]), float(sys.argv[2]) if len(sys.argv) > 2 else 12.0
-    table = format.read(path)
+    table = tsdf_format.read(path)
     grain, block = GrainSpec(table), block_of(table)
     for fraction in FRACTIONS:
         line = ", ".join(f"{name} {ns:.0f} ns ({ratio:.2f})" for name, (ns, ratio) in times(grain, fraction).items())

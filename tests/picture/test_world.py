@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.errors import SceneError
 from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
@@ -82,18 +82,18 @@ def heap(ball, radius, shape=CUBE, camera=None, absorption=0.0):
 
 
 def test_grains_too_small_for_their_medium_are_refused(ball):
-    """Grains of 1e-12 in a box of 4: a path would meet 1e12. Where they absorb, paths end, and the scene is built; from
-    1e5 grains on a note says how long it takes."""
+    """Grains of 1e-12 in a box of 4: a path without leaps would meet 1e12. Where they absorb, paths end, and the scene
+    is built; from 1e5 grains on a note says how long it takes."""
     for level in ("teleport", "volume-hg", "isotropic"):
         with pytest.raises(
             SceneError, match=r"heap: \[\[medium\]\] 1 \(heap\): light meets about .*take larger grains"
         ):
-            world.build(heap(ball, 1e-12), level)
+            world.build(heap(ball, 1e-12), level, leap=0.0)
     nameless = replace(heap(ball, 1e-12), media=(replace(heap(ball, 1e-12).media[0], name=""),))
     with pytest.raises(SceneError, match=r"heap: \[\[medium\]\] 1: light meets"):
-        world.build(nameless, "teleport")
+        world.build(nameless, "teleport", leap=0.0)
     assert not world.build(heap(ball, 1e-12, absorption=1e10), "teleport").notes
-    (note,) = world.build(heap(ball, 2e-6), "teleport").notes
+    (note,) = world.build(heap(ball, 2e-6), "teleport", leap=0.0).notes
     assert "light meets about 5e+05 grains" in note and "s of one thread" in note
     assert not world.build(heap(ball, 0.01), "teleport").notes
 
@@ -144,13 +144,13 @@ def test_how_far_the_target_is_does_not_matter(distance):
 
 def test_each_file_is_read_once(tmp_path, ball, monkeypatch):
     """A table named by 64 grains, through links and other spellings, is read once."""
-    format.write(ball, tmp_path / "ball.tsdf.exr")
+    tsdf_format.write(ball, tmp_path / "ball.tsdf.exr")
     (tmp_path / "link.exr").symlink_to("ball.tsdf.exr")
     names = ["ball.tsdf.exr", "link.exr", "../" + tmp_path.name + "/ball.tsdf.exr"]
     grains = tuple(GrainSpec(tmp_path / names[i % 3]) for i in range(64))
     reads = []
-    original = format.read
-    monkeypatch.setattr(format, "read", lambda path: reads.append(path) or original(path))
+    original = tsdf_format.read
+    monkeypatch.setattr(tsdf_format, "read", lambda path: reads.append(path) or original(path))
     scene = Scene(replace(CAMERA, position=(-9.0, 0.0, 0.0)), ONE, (MediumSpec(CUBE, 0.5, 0.1, grains),))
     made = world.build(scene, "teleport")
     assert len(reads) == 1

@@ -186,6 +186,18 @@ def test_impossible_levels_are_said(ball: Scene) -> None:
     assert any(note.startswith("teleport-joint is skipped: ") for note in loose.notes)
 
 
+def test_explicit_grains_are_for_the_levels_that_take_them(ball: Scene) -> None:
+    """A chain is another one where a scene asks for them, a volume the same as without, and the report says so."""
+    asks = replace(ball, render=replace(ball.render, explicit_grains=1000))
+    one, other = (compare.compare(s, ["teleport", "volume"], spp=4, packings=2) for s in (asks, ball))
+    chains = [found.rows[1].picture.rgb for found in (one, other)]
+    assert [row.level for row in one.rows] == ["explicit", "teleport", "volume"]
+    assert not np.array_equal(*chains)
+    assert np.array_equal(one.rows[2].picture.rgb, other.rows[2].picture.rgb)
+    assert any("first 1000 grains" in note for note in one.notes)
+    assert not any("grains as" in note for note in other.notes)
+
+
 def test_a_furnace_has_no_error_and_no_noise(ball: Scene) -> None:
     """Lossless grains in light of radiance 1 are 1 at every level, and reports of no noise at all are written."""
     found = compare.compare(replace(ball, surfaces=()), ["volume"], spp=4, packings=2)

@@ -1,4 +1,4 @@
-"""Every level of a scene against single grains: what each gets wrong, and what it costs.
+"""Comparison: every level of a scene against single grains, what each gets wrong, and what it costs.
 
 The reference is the mean of the explicit level over several packings, so its own noise, the grains' places included, is
 known per pixel from the packings' spread. Noise is taken off squared differences rather than left in, which needs

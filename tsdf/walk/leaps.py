@@ -28,11 +28,11 @@ ROOM, MARGIN, PACE, UNIT = range(4)
 
 
 class Leaps(NamedTuple):
-    """What kernels ask about leaps in media (m,); lengths in scene units, those of records in `unit` of each medium.
+    """What kernels ask about leaps in media (m,); lengths in scene units, those of records in each medium's unit.
 
-    size (m, 4): ROOM, radius of the smallest ball, infinite where there are no leaps; MARGIN, what is left free around
-    a ball; PACE, root of the mean square step; UNIT. middle (m, cells, 2), cells (m,): where a ball's middle is from
-    the place of an entry, along the direction and the side of the entry, by cells of the squared impact parameter.
+    size (m, 4): ROOM, radius of the smallest ball, infinite where there are no leaps; MARGIN, what is left free
+    around a ball; PACE, root of the mean square step; UNIT. middle (m, cells, 2), cells (m,): where a ball's middle is
+    from the place of an entry, along the direction and the side of the entry, by cells of the squared impact parameter.
     balls (m, k, 4), of the records: squared radius, A, B, and 1 / (r^2 + 2 A r + B). records (m, k, n, 8), crossed
     (m, k, n, components + 1) float32: see `passage.Passage`; kept (m,): how many of n.
     """

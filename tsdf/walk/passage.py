@@ -42,7 +42,8 @@ CLASSES = 8  # of radii, each sqrt 2 of the one before
 LEAST_RADIUS = 6.0  # [R] of the first class where grains are spheres: smaller balls are of a few grains
 RECORDS = 4096  # of each class
 FEWEST = 512  # where light hardly turns, and a record takes very many events
-BUDGET = 3e7  # events that making records may take, unless there would be fewer than that
+TRIED = (16, 16, 16, 16, 8, 8, 4, 4)  # times as many whose means the records are given, most of the balls most used
+BUDGET = 6e7  # events that making records may take, unless there would be fewer than FEWEST
 DRAWS = 1 << 20  # of deflections, for their means
 BATCHES = 16  # of these draws: the errors are what they differ by
 DEPTH, NU, MU, CHI, PSI, B, FLIGHT, GRAINS = range(8)  # columns of records: see `Passage`
@@ -69,12 +70,12 @@ class Passage:
     radius : (classes,) float64
         Of the balls.
     numbers : (classes, 4) float64
-        A and B of reff^2 = r^2 + 2 A r + B = step2 E[N]; what the mean N of the records was over that, which they have
-        been corrected for, and its standard error.
+        A and B of reff^2 = r^2 + 2 A r + B = step2 E[N]; what the mean N was over that, which records have been
+        corrected for, and its standard error.
     records : (classes, n, 8) float32
         Where and whither the last grain was left: depth below the ball's surface; cosine nu between the way there from
-        the middle, u, and the direction at the start, d_0; cosine mu between u and the direction d now; azimuth chi of d
-        about u, from d_0 [turns]. What is entered next: azimuth psi of its side about d, from u [turns]; its impact
+        the middle, u, and the direction at the start, d_0; cosine mu between u and the direction d now; azimuth chi of
+        d about u, from d_0 [turns]. What is entered next: azimuth psi of its side about d, from u [turns]; its impact
         parameter; the flight there, still pending. And N.
     crossed : (classes, n, components + 1) float32
         Path length in the matter of each component [R], events where it has none; and the length flown.
@@ -104,8 +105,8 @@ def component(choice, first, last, u):
 
 @njit(**KERNEL)
 def drawn(chain, m, first, last, seed, sums):
-    """Add up what the mean step needs over draws `first` to `last` of a level that draws free paths: g, z, the square
-    of the offset, and its part along the new direction; lengths in R."""
+    """Add up what the mean step needs over draws `first` to `last` of a level that draws free paths: cosines, z, the
+    square of the offset, and its part along the new direction; lengths in R."""
     media = chain.media
     begin = media.first[m]
     end = begin + media.kinds[m] - 1
@@ -336,31 +337,43 @@ def _of_memory(memory: M.Memory, m: int, first: int, kinds: int) -> Means:
 # ------------------------------------------------------------------------------------------- making, keeping
 
 
-def _numbers(records: np.ndarray, radius: float, means: Means) -> list[float]:
-    """Return a row of `Passage.numbers`, and correct records by what is known exactly: M is in the middle in the mean,
-    and the mean of its square tells that of N."""
-    ahead, aside = means.ahead, means.aside
-    depth, nu, mu, chi, psi, b, s, n = records.T
-    cell = np.minimum((b * b * len(ahead)).astype(np.int64), len(ahead) - 1)
-    along, across, sine = s + ahead[cell], aside[cell], np.sqrt(np.maximum(0.0, 1.0 - mu * mu))
+def _ahead(records: np.ndarray, means: Means) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the parts of M, seen from where the last grain was left: along u, across it toward d_0, and its square."""
+    _, _, mu, chi, psi, b, s, _ = records.T
+    cell = np.minimum((b * b * len(means.ahead)).astype(np.int64), len(means.ahead) - 1)
+    along, across, sine = s + means.ahead[cell], means.aside[cell], np.sqrt(np.maximum(0.0, 1.0 - mu * mu))
     (co_chi, si_chi), (co_psi, si_psi) = ((np.cos(2.0 * np.pi * x), np.sin(2.0 * np.pi * x)) for x in (chi, psi))
-    out = along * mu + across * co_psi * sine  # of M, from the last exit, along u
-    beside = along * sine * co_chi + across * (si_psi * si_chi - co_psi * mu * co_chi)  # and across, toward d_0
+    beside = along * sine * co_chi + across * (si_psi * si_chi - co_psi * mu * co_chi)
+    return along * mu + across * co_psi * sine, beside, along**2 + across**2
 
-    def turned(by: float) -> np.ndarray:
-        return np.asarray(np.clip(nu + by * (1.0 - nu * nu), -1.0, 1.0))
 
-    by = 0.0
-    for _ in range(4):
-        new = turned(by)
-        off = ((radius - depth + out) * new + beside * np.sqrt(1.0 - new * new)).mean()
-        by -= off / ((radius - depth + out) * (1.0 - nu * nu)).mean()
-    records[:, NU] = turned(by)
-    square = depth**2 - 2.0 * depth * out + along**2 + across**2
-    a, b2 = float((out - depth).mean()), float(square.mean())
-    each = n * (means.step2 / (radius * radius + 2.0 * a * radius + b2))
-    records[:, GRAINS] /= each.mean()
-    return [a, b2, float(each.mean()), float(each.std()) / math.sqrt(len(n))]
+def _corrected(tried: Sequence[np.ndarray], radius: np.ndarray, turn: float, means: Means) -> np.ndarray:
+    """Return `Passage.numbers`, and correct the records that will be kept by what is known better than they know it.
+
+    M is in the middle of the ball in the mean, and the mean of its square tells that of N. A is a smooth function of
+    the radius.
+    """
+    count = min(len(one) // times for one, times in zip(tried, TRIED, strict=True))
+    parts = [_ahead(one, means) for one in tried]
+    off = [out - one[:, DEPTH] for one, (out, _, _) in zip(tried, parts, strict=True)]
+    error = np.array([one.std() / math.sqrt(len(one)) for one in off])
+    x = turn / radius
+    a = np.polyval(np.polyfit(x, [one.mean() for one in off], 2, w=1.0 / error), x)
+    numbers = []
+    for one, (out, beside, square), r, mean in zip(tried, parts, radius, a, strict=True):
+        depth, n = one[:, DEPTH], one[:, GRAINS]
+        b2 = float((depth**2 - 2.0 * depth * out + square).mean())
+        each = n * (means.step2 / (r * r + 2.0 * mean * r + b2))
+        numbers.append([float(mean), b2, float(each[:count].mean()), float(each.std()) / math.sqrt(count)])
+        n[:count] /= each[:count].mean()
+        depth[:count] += (out - depth)[:count].mean() - mean
+        nu, far = one[:count, NU].copy(), (r - depth + out)[:count]
+        by, new = 0.0, nu
+        for _ in range(4):
+            by -= (far * new + beside[:count] * np.sqrt(1.0 - new * new)).mean() / (far * (1.0 - nu * nu)).mean()
+            new = np.clip(nu + by * (1.0 - nu * nu), -1.0, 1.0)
+        one[:count, NU] = new
+    return np.array(numbers)
 
 
 def made(
@@ -391,40 +404,35 @@ def made(
             means = _of_free_paths(handle, m, mean, scale, pool)
         turn = means.step2 / (2.0 * means.shift)
         radius = max(turn, LEAST_RADIUS * scale) * 2.0 ** (0.5 * np.arange(CLASSES))
-        events = float(((radius + turn) ** 2).sum() / means.step2)
+        events = float(np.dot(TRIED, (radius + turn) ** 2)) / means.step2
         count = int(min(RECORDS, max(FEWEST, BUDGET / events)))
-        records = np.zeros((CLASSES, count, GRAINS + 1))
-        crossed = np.zeros((CLASSES, count, kinds + 1))
-        parts = 8
-        jobs = [
-            (k, count * i // parts, count * (i + 1) // parts) for k in reversed(range(CLASSES)) for i in range(parts)
-        ]
+        tried = [np.zeros((times * count, GRAINS + 1)) for times in TRIED]
+        crossed = [np.zeros((times * count, kinds + 1)) for times in TRIED]
+        jobs = [(k, count * i, count * (i + 1)) for k in reversed(range(CLASSES)) for i in range(TRIED[k])]
 
         def one(job: tuple[int, int, int]) -> float:
             k, first, last = job
             where = (first, last, np.uint64(1000 + k), float(radius[k]))
             if traits.remembers:
-                remembered(handle, m, where, means.ahead, means.aside, records[k], crossed[k])
+                remembered(handle, m, where, means.ahead, means.aside, tried[k], crossed[k])
             else:
-                flown(handle, m, (*where, mean), means.ahead, records[k], crossed[k])
+                flown(handle, m, (*where, mean), means.ahead, tried[k], crossed[k])
             return (last - first) * float(radius[k]) ** 2
 
-        done, total = 0.0, count * float((radius**2).sum())
+        done, total = 0.0, count * float(np.dot(TRIED, radius**2))
         for part in pool.map(one, jobs):
             done += part
             if progress is not None:
                 progress(done / total)
-    numbers = np.array([_numbers(one, r, means) for one, r in zip(records, radius, strict=True)])
-    crossed /= numbers[:, None, None, 2]
-    return Passage(
-        means.ahead, means.aside, means.step2, turn, radius, numbers, records.astype(np.float32),
-        crossed.astype(np.float32),
-    )  # fmt: skip
+    numbers = _corrected(tried, radius, turn, means)
+    records = np.array([one[:count] for one in tried], np.float32)
+    lengths = np.array([one[:count] / by for one, by in zip(crossed, numbers[:, 2], strict=True)], np.float32)
+    return Passage(means.ahead, means.aside, means.step2, turn, radius, numbers, records, lengths)
 
 
 def _digest(traits: Traits, grains: Sequence[tuple[Table, float]], *numbers: float) -> str:
     """Return what tells records from others: all that they are made of, but for the text of this package."""
-    found = hashlib.sha256(repr((VERSION, RECORDS, CLASSES, tuple(traits), numbers)).encode())
+    found = hashlib.sha256(repr((VERSION, RECORDS, TRIED, tuple(traits), numbers)).encode())
     for table, share in grains:
         found.update(json.dumps(thawed(table.header), sort_keys=True).encode())
         found.update(table.pixels.data)
