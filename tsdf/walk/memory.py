@@ -153,14 +153,8 @@ def sent_on(memory, c, column, u, t, d):
     """Return what a grain of component c does to light along d that meets it on side t, its impact parameter in that
     column, by the record that u stands for: direction, side and impact parameter of the exit, path length [R]."""
     grain = memory.grains[c, column, int(u * memory.kept[c])]
-    up = cross(d, t)
-    x, y, z = float(grain[0]), float(grain[1]), float(grain[2])
-    new = step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d)
-    half = 1.5 - 0.5 * dot(new, new)
-    new = (new[0] * half, new[1] * half, new[2] * half)
-    x, y, z = float(grain[3]), float(grain[4]), float(grain[5])
-    t = upright(step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d), new)
-    return new, t, float(grain[6]), float(grain[7])
+    d, t, b, _ = sent(grain, d, t)
+    return d, t, b, float(grain[7])
 
 
 @njit(**KERNEL)
