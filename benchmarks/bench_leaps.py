@@ -68,7 +68,7 @@ def batch(e: Experiment, paths: int, first: int) -> np.ndarray:
 
 
 def sooner(pair: list[Experiment], seconds: float) -> float:
-    """Return how many times sooner paths of a picture end with leaps, by processor time, in turn; the median of some."""
+    """Return how many times sooner paths of a picture end with leaps, by processor time: the median of some rounds."""
     walkers, halt, ratios = [Walkers(e.world) for e in pair], threading.Event(), []
     counts = [256, 256]
     for number in range(1 + ROUNDS):
