@@ -78,6 +78,7 @@ bench: .venv/installed  ## measure speed and error side by side, into bench/
 	$(BIN)/python benchmarks/bench.py
 	$(BIN)/python benchmarks/bench_sampler.py
 	$(BIN)/python benchmarks/bench_render.py
+	$(BIN)/python benchmarks/bench_mitsuba.py
 
 FUZZERS := tables meshes scenes builds signals
 

@@ -26,7 +26,7 @@ from tsdf.picture import image, render, world
 from tsdf.scene.scene import Camera, EnvironmentLight, GrainSpec, MediumSpec, Render, Scene, Slab, load, resized
 from tsdf.spheres.packing import pack
 from tsdf.study.experiment import SPHERES, gather, slab_experiment
-from tsdf.walk import transport as T
+from tsdf.walk import transport
 
 COUNTS = (0, 1, 2, 3, 5, 7, 10)
 FRACTION = 0.6
@@ -86,9 +86,9 @@ def texture(effort: float, folder: Path) -> None:
                 Scene(ABOVE, (EnvironmentLight(folder / "sky.exr"),), (spec,), render=Render(explicit_grains=k)), level
             )
             if w > 0.0:  # noqa: B023
-                grid = T.Camera((0.0, 0.0, layer), (w, 0.0, 0.0), (0.0, w, 0.0), DOWN, STILL, STILL, side)  # noqa: B023
+                grid = transport.Camera((0.0, 0.0, layer), (w, 0.0, 0.0), (0.0, w, 0.0), DOWN, STILL, STILL, side)  # noqa: B023
                 return render.measure(made, grid, side, side, spp, seed=seed, threads=1).rgb[..., 1].ravel()  # noqa: B023
-            rays = [T.Camera((2.3 * i, 2.3 * j, layer), STILL, STILL, DOWN, STILL, STILL, 1)  # noqa: B023
+            rays = [transport.Camera((2.3 * i, 2.3 * j, layer), STILL, STILL, DOWN, STILL, STILL, 1)  # noqa: B023
                     for i, j in itertools.product(range(side), repeat=2)]  # noqa: B023  # fmt: skip
             return np.array([
                 render.measure(made, ray, spp=spp, seed=len(rays) * seed + i, threads=1).rgb[0, 0, 1]  # noqa: B023
@@ -116,34 +116,27 @@ def timed(scene: Scene, level: str, k: int, spp: int, seeds: tuple[int, ...]) ->
     return pictures, (time.process_time() - began) / len(seeds)
 
 
-def beads(effort: float, width: int = 320, write: Path | None = None) -> None:
+def beads(effort: float, width: int = 320) -> None:
     """Print how far the beads are from those traced one by one, in the picture and where there are beads."""
     scene = resized(load(Path(__file__).parents[1] / "scenes" / "beads.toml"), width)
     spp = max(4, int(effort * 48))
     truth, taken = timed(scene, "explicit", 0, spp, (1, 2))
-    # Pixels of the pile: where a picture without the table's texture would be, where grains are met
     bare = timed(replace(scene, media=()), "explicit", 0, spp, (3,))[0][0].rgb @ LUMINANCE
     light = [picture.rgb @ LUMINANCE for picture in truth]
     pile = np.abs(0.5 * (light[0] + light[1]) - bare) > 0.1 * bare
-    mean = np.mean(light)
-    print(f"beads {width} wide, {spp} spp | k | rms [% of the mean] | in the pile | mean of |difference| | noise of it "
-          "| bias [%] | time to teleport-memory")  # fmt: skip
-    base = 0.0
+    mean, base = np.mean(light), 0.0
+    print(f"beads {width} wide, {spp} spp: k | rms [% of the mean] | in the pile | bias [%] | variance to explicit "
+          "| time per sample to teleport-memory")  # fmt: skip
     for k in (0, 2, 5, 10):
         made, own = timed(scene, "teleport-memory", k, spp, (1, 2))
         base = base or own
         one, other = (picture.rgb @ LUMINANCE - it for picture, it in zip(made, light, strict=True))
         square = one * other / mean**2
-        deviation = sum(picture.variance @ LUMINANCE**2 for picture in (*made, *truth)) / 4.0
         rms, inside = (100.0 * math.sqrt(max(0.0, some.mean())) for some in (square, square[pile]))
-        absolute, noise = np.abs(0.5 * (one + other)).mean(), np.sqrt(2.0 / math.pi * deviation).mean()
-        print(f"{k} | {rms:.1f} | {inside:.1f} | {100 * absolute / mean:.1f} | {100 * noise / mean:.1f} "
-              f"| {100 * 0.5 * (one + other).mean() / mean:+.2f} | {own / base:.2f}", flush=True)  # fmt: skip
-        if write is not None:
-            image.write_png(write / f"beads{k}.png", 0.5 * (made[0].rgb + made[1].rgb), scene.camera.exposure)
-    print(f"explicit | | | | | | {taken / base:.2f}")
-    if write is not None:
-        image.write_png(write / "beads_explicit.png", 0.5 * (truth[0].rgb + truth[1].rgb), scene.camera.exposure)
+        variance = made[0].variance.mean() / truth[0].variance.mean()
+        print(f"{k} | {rms:.1f} | {inside:.1f} | {100 * 0.5 * (one + other).mean() / mean:+.2f} | {variance:.2f} "
+              f"| {own / base:.2f}", flush=True)  # fmt: skip
+    print(f"explicit | | | | 1 | {taken / base:.2f}")
 
 
 def facets(effort: float, folder: Path) -> None:

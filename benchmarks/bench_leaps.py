@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
 from tsdf.picture.render import Walkers
 from tsdf.picture.world import beam, build
@@ -128,7 +128,7 @@ def main() -> None:
         "--seconds", type=float, default=20.0, help="of one thread, for each body without and with leaps"
     )
     arguments = parser.parse_args()
-    table = format.read(arguments.table)
+    table = tsdf_format.read(arguments.table)
     for ball, sizes in ((False, arguments.slab), (True, arguments.ball)):
         for size in sizes:
             name = f"{'ball' if ball else 'slab'} {size:g} R, {arguments.level}, f {arguments.packing:g}"

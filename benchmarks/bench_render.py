@@ -1,16 +1,16 @@
 """Measure the renderer: ``python benchmarks/bench_render.py --help``. Writes DIR/render.md.
 
-(a) Grain events per second deep inside a large medium, at each level, with one and two threads, beside the cost of
-drawing an event alone (`bench_sampler`). (b) Time to equal variance of multiply scattered light, explicit against
-teleport. Multiply scattered light is the diffuse reflectance of a thick slab of lossless grains: light that a grain
-sends back at its first event is a few per cent of it, and its share is stated. (c) Beside each, a furnace of radiance
-1 around the same grains, which must read 1: a fast wrong answer shows. (d) The explicit level's rays per second against
-what the ray engine alone makes of the very same rays. (e) Where pictures are made: a cube of 4 R, balls of 80 to
-80,000 facets and grains of 1/10 to 1/10,000 of them, beside the bulk, and the scenes of scenes/ where `make demo` has
-made their tables. What is compared runs in turn in one process; numbers are medians
-over rounds, ratios medians of the ratios of a round. Where others share the machine, processor time is steadier than
-the wall's: (b) and (d) use it, (a) gives both, and the scaling of two kernels that share nothing, which is what the
-machine has to give.
+(a) Grain events per second deep inside a large medium, without leaps, at each level, with one and two threads, beside
+the cost of drawing an event alone (`bench_sampler`). (b) Time to equal variance of multiply scattered light, explicit
+against teleport. Multiply scattered light is the diffuse reflectance of a thick slab of lossless grains: light that a
+grain sends back at its first event is a few per cent of it, and its share is stated. (c) Beside each, a furnace of
+radiance 1 around the same grains, which must read 1: a fast wrong answer shows. (d) The explicit level's rays per
+second against what the ray engine alone makes of the very same rays. (e) Where pictures are made: a cube of 4 R,
+balls of 80 to 80,000 facets and grains of 1/10 to 1/100,000 of them, beside the bulk, and the scenes of scenes/ where
+`make demo` has made their tables. What is compared runs in turn in one process; numbers are medians over rounds,
+ratios medians of the ratios of a round. Where others share the machine, processor time is steadier than the wall's:
+(b) and (d) use it, (a) gives both, and the scaling of two kernels that share nothing, which is what the machine has
+to give.
 """
 
 import argparse
@@ -35,6 +35,7 @@ from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Build, Effort, exact_sphere
 from tsdf.picture import image, render, world
 from tsdf.picture.render import Picture, Walkers
+from tsdf.scene.levels import LEVELS
 from tsdf.scene.scene import (
     Absorption,
     Box,
@@ -42,8 +43,6 @@ from tsdf.scene.scene import (
     ConstantLight,
     EnvironmentLight,
     GrainSpec,
-    Light,
-    MediumShape,
     MediumSpec,
     Mesh,
     Scene,
@@ -53,6 +52,7 @@ from tsdf.scene.scene import (
     load,
     resized,
 )
+from tsdf.scene.specs import Light, MediumShape
 from tsdf.walk.transport import EVENTS, Job
 
 FRACTION = 0.6
@@ -60,7 +60,7 @@ LARGE = 500.0  # [R] radius of the ball of grains
 THICK = 60.0  # [R] thickness of the slab
 FACETS = 5  # subdivisions of the icosphere: 20,480 facets
 ETA = 1.31
-DEEP = ("teleport", "teleport-memory", "teleport-joint", "volume", "volume-hg", "isotropic")
+DEEP = tuple(name for name, level in LEVELS.items() if level.traits.leaps)
 DRAWS = {"teleport": "Algorithm 1", "teleport-joint": "joint records", "volume-hg": "Henyey-Greenstein"}
 MEMORY = 64  # records per cell of entry
 SCENES = Path(__file__).parent.parent / "scenes"
@@ -111,7 +111,7 @@ def events(tables: dict[str, Table], rounds: int, many: int) -> list[str]:
             draw(1000)  # compiles
         draws: dict[str, list[float]] = {way: [] for way in works}
         ball = scene(table, Sphere((0.0, 0.0, 0.0), LARGE), ConstantLight((1.0, 1.0, 1.0)))
-        made = {level: world.build(ball, level) for level in DEEP}
+        made = {level: world.build(ball, level, leap=0.0) for level in DEEP}
         spp, checks = {}, {}
         for level, one in made.items():
             first = render.render(one, spp=512, threads=1, seed=99)
@@ -288,18 +288,20 @@ def near(table: Table, rounds: int, spp: int, folder: Path) -> list[str]:
 
     white, sun = ConstantLight((1.0, 1.0, 1.0)), SunLight((-0.48, -0.36, 0.8), (3.0, 3.0, 3.0))
     box = Box((-4.0, -4.0, -4.0), (4.0, 4.0, 4.0))
-    bulk = world.build(scene(table, Sphere((0.0, 0.0, 0.0), LARGE), white), "teleport")
+    bulk = world.build(scene(table, Sphere((0.0, 0.0, 0.0), LARGE), white), "teleport", leap=0.0)
     made = {
-        f"cube of half side 4 R, {name}, {level}": world.build(outlook(table, box, 4.0, 1.0, light), level)
+        f"cube of half side 4 R, {name}, {level}": world.build(outlook(table, box, 4.0, 1.0, light), level, leap=0.0)
         for name, light in (("constant", white), ("sun", sun))
         for level in ("teleport", "teleport-memory")
     }
     for subdivisions in (1, 3, 6):
         mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
         mesh.export(folder / f"{subdivisions}.ply")
-        for radius in (1e-1, 1e-2, 1e-4):
+        for radius in (1e-1, 1e-2, 1e-4, 1e-5):
             one = outlook(table, Mesh(folder / f"{subdivisions}.ply"), 1.0, radius, sun)
-            made[f"ball of {len(mesh.faces)} facets, grains of {radius:g}, sun"] = world.build(one, "teleport")
+            made[f"ball of {len(mesh.faces)} facets, grains of {radius:g}, sun"] = world.build(
+                one, "teleport", leap=0.0
+            )
     for name, levels in SHIPPED.items():
         try:
             shipped = resized(load(SCENES / f"{name}.toml"), 160)

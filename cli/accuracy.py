@@ -36,7 +36,7 @@ MEASURED = ("explicit", "teleport-packed", "teleport-memory", "teleport-joint", 
     help="Thickness of the layer of centres of a slab's grains [R]; may be given several times.",
 )  # fmt: skip
 @click.option("--levels", metavar="A,B,..", help=f"Levels to measure.  [default: {','.join(MEASURED)}]")
-@click.option("--mesh", type=click.Path(path_type=Path), metavar="FILE", help="Of a grain that is not built in.")
+@click.option("--mesh", type=click.Path(path_type=Path), metavar="FILE", help="Of a grain that is not beside TABLE.")
 @click.option(
     "--seconds", type=float, metavar="S",
     help="Time of measuring, after a start that makes packings and compiles once for this machine.  [default: 300]",
@@ -65,12 +65,12 @@ def main(
     chosen = named_levels(levels, MEASURED)
     check_numbers(seed, threads=threads)
 
-    from tsdf.data import format
+    from tsdf.data import format as tsdf_format
     from tsdf.scene.scene import GrainSpec
     from tsdf.study import accuracy, plots
     from tsdf.walk.explicit import mesh_beside
 
-    read = format.read(table)
+    read = tsdf_format.read(table)
     mesh = mesh or mesh_beside(read, [table.parent])
     meshes = [] if mesh is None else [mesh]
     check_folder(out, ["accuracy.md", "accuracy.csv", "accuracy.png"], table, *meshes)

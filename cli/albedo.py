@@ -32,7 +32,7 @@ from tsdf.errors import UsageError
     "--depth", callback=spectral.metres, metavar="LENGTH", help="To which --profile goes in a half-space."
 )  # fmt: skip
 @click.option(
-    "--error", type=float, default=0.001, show_default=True, metavar="E", help="Standard error at which to stop."
+    "--error", type=float, default=0.0007, show_default=True, metavar="E", help="Standard error at which to stop."
 )  # fmt: skip
 @click.option("--paths", callback=whole_number, metavar="N", help="Paths of each set, instead of --error.")
 @click.option(
@@ -69,17 +69,19 @@ def main(  # noqa: PLR0913 - an argument for each option
 
         check_suffix(plot)
 
-    from tsdf.study import slabs
+    from tsdf.study import slabs, spectra
 
     with working(quiet) as work:
         records = {"memory": {"memory": 64}, "joint": {"joint": 32}}
         needed = slabs.records_of(level)
-        family, found, size = asked.scattering(
-            lambda share, word: work.progress(0.3 * share, word), seed, **records.get(needed or "", {})
+        c = asked.constants()
+        family = asked.family(
+            c, lambda share, word: work.progress(0.3 * share, word), seed, **records.get(needed or "", {})
         )
-        if density is not None:
-            packing = spectral.packing_of(family, asked.material, density)
-        radius = found.radius
+        words = asked.words(family, **({"packing_fraction": packing} if density is None else {"density": density}))
+        assert words.packing_fraction is not None
+        packing, radius = words.packing_fraction, words.radius
+        found = spectra.spectrum(family, c, radius)
         request = slabs.Request(
             level, packing, math.inf if thickness is None else thickness / radius,
             None if angle is None else math.cos(math.radians(angle)), ground, profile,
@@ -89,7 +91,7 @@ def main(  # noqa: PLR0913 - an argument for each option
             family, found, request, error, seed, asked.threads, paths,
             lambda share, word: work.progress(0.3 + 0.7 * share, word),
         )  # fmt: skip
-    c, name = found.constants, family.tables[0].header["grain"]["name"]
+    name, size = family.tables[0].header["grain"]["name"], asked.told(words)
     body = "half-space" if thickness is None else f"slab of {thickness:g} m"
     light = "diffuse light" if angle is None else f"light at {angle:g} degrees"
     over = f" over ground of reflectance {ground:g}" if ground else ""

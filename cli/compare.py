@@ -58,7 +58,8 @@ def main(
     chosen = named_levels(levels, LEVELS)
     check_numbers(seed, spp=spp, width=width, threads=threads)
 
-    from tsdf.scene.scene import files_of, load, resized
+    from tsdf.scene.scene import load, resized
+    from tsdf.scene.specs import files_of
     from tsdf.study import compare, plots
 
     read = resized(load(scene), width)

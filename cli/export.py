@@ -8,11 +8,32 @@ import click
 from tsdf.cli.common import Tool, check_output, plain, write_text
 from tsdf.cli.sizes import colour_of, coloured, in_words, said, sized
 
-TARGETS = ("pbrt", "blender", "openpbr", "materialx", "arnold", "karma", "csv", "npz")
+SPECTRAL = ("tartes", "snicar", "disort", "eradiate", "phase")  # `radiative` writes them
+TARGETS = ("pbrt", "blender", "openpbr", "materialx", "arnold", "karma", "csv", "npz", *SPECTRAL)
+
+
+def _check_numbers(
+    words: dict[str, float], unit: float | None, kept: float, thickness: float | None, colour_thickness: float | None
+) -> None:
+    """Refuse what no medium can have."""
+    from tsdf.errors import UsageError
+    from tsdf.scene.sizes import SIZES
+
+    if not 0.0 < kept < 1.0:
+        raise UsageError(f"--kept is a share > 0 and < 1, not {kept:g}")
+    if thickness is not None and not thickness > 0.0:
+        raise UsageError(f"--thickness is a number > 0, not {thickness:g}")
+    if not any(word in words for word in SIZES):
+        raise UsageError("say how large grains are: give one of --radius, --effective-radius, --sieve, ... (--help)")
+    for name, value in (("--unit", unit), ("--colour-thickness", colour_thickness)):
+        if value is not None and not 0.0 < value < math.inf:
+            raise UsageError(f"{name} is a finite number > 0, not {value:g}")
+    if not 1e-30 <= words.get("radius", 1.0) <= 1e30:
+        raise UsageError(f"--radius is a number of scene units from 1e-30 to 1e30, not {words['radius']:g}")
 
 
 @click.command("tsdf-export", cls=Tool)
-@click.argument("file")
+@click.argument("files", nargs=-1, required=True, metavar="FILE..")
 @click.option("--to", required=True, type=click.Choice(TARGETS), help="What to write for.")
 @sized
 @coloured
@@ -41,49 +62,60 @@ TARGETS = ("pbrt", "blender", "openpbr", "materialx", "arnold", "karma", "csv", 
     "--thickness", type=float, metavar="L", help="Of the body in scene units, for the bounces.  [default: deep]"
 )  # fmt: skip
 @click.option("--measure", is_flag=True, help="Render a slab of 40 R to find the error of point scatterers.")
-@click.option("--out", metavar="PATH", help="File to write.  [default: standard output; npz needs it]")
-def main(
-    file: str, to: str, absorption: str | None, material: str | None, deep_colour: str | None,
+@click.option(
+    "--wavelength-nm", metavar="FROM:TO:STEP|A,B,..",
+    help="For tartes, disort, eradiate, phase [nm].  [default: 300:2500:10; snicar has its own]",
+)  # fmt: skip
+@click.option(
+    "--orders", type=click.IntRange(1, 1024), default=128, show_default=True, metavar="N",
+    help="Highest Legendre moment for disort.",
+)  # fmt: skip
+@click.option("--out", metavar="PATH", help="File to write.  [default: standard output; npz and netCDF need it]")
+def main(  # noqa: PLR0913 - an argument for each option
+    files: tuple[str, ...], to: str, absorption: str | None, material: str | None, deep_colour: str | None,
     colour_thickness: float | None, unit: float | None, lobes: int | None, kept: float, thickness: float | None,
-    measure: bool, out: str | None, **options: float | None,
+    measure: bool, wavelength_nm: str | None, orders: int, out: str | None, **options: float | None,
 ) -> None:  # fmt: skip
     """Write the medium of grains of the table FILE for another renderer, or the table as plain arrays.
 
     Each text says what level of model it stands for, what that costs and how many bounces it needs; a page on each
-    target is in the folder docs.
+    target is in the folder docs. For tartes, snicar, disort, eradiate and phase, FILE may be several tables of one
+    grain at several indices, or a grain as of tsdf-optics; their lengths are in metres unless --unit says otherwise.
     """
+    if to in SPECTRAL:
+        from tsdf.cli import radiative
+
+        for name, given in (("--deep-colour", deep_colour), ("--lobes", lobes), ("--thickness", thickness)):
+            if given is not None:
+                raise click.UsageError(f"{name} is not for --to {to}")
+        radiative.export(files, to, radiative.Said(absorption, material, wavelength_nm, unit, orders, out, options))
+        return
+    if len(files) > 1:
+        raise click.UsageError(f"--to {to} takes one table, not {len(files)}")
+    if wavelength_nm is not None:
+        raise click.UsageError(f"--wavelength-nm is not for --to {to}")
+    file = files[0]
     from tsdf.cli.absorption import conventions, times_radius
     from tsdf.errors import UsageError
-    from tsdf.scene.sizes import SIZES
 
-    if not 0.0 < kept < 1.0:
-        raise UsageError(f"--kept is a share > 0 and < 1, not {kept:g}")
-    if thickness is not None and not thickness > 0.0:
-        raise UsageError(f"--thickness is a number > 0, not {thickness:g}")
     words, colour = said(options), colour_of(deep_colour)
+    _check_numbers(words, unit=unit, kept=kept, thickness=thickness, colour_thickness=colour_thickness)
     if sum(given is not None for given in (absorption, material, deep_colour)) > 1:
         raise UsageError("--absorption, --material and --deep-colour all say how grains absorb: give one")
     if material is not None and unit is None:
         raise UsageError(f"absorption of {plain(material)} is per metre: say with --unit how long the scene unit is")
-    if not any(word in words for word in SIZES):
-        raise UsageError("say how large grains are: give one of --radius, --effective-radius, --sieve, ... (--help)")
-    for name, value in (("--unit", unit), ("--colour-thickness", colour_thickness)):
-        if value is not None and not 0.0 < value < math.inf:
-            raise UsageError(f"{name} is a finite number > 0, not {value:g}")
-    if not 1e-30 <= words.get("radius", 1.0) <= 1e30:
-        raise UsageError(f"--radius is a number of scene units from 1e-30 to 1e30, not {words['radius']:g}")
     if to == "npz" and out is None:
         raise UsageError("npz is no text: say with --out where to write it")
     if out is not None:
         check_output(Path(out), Path(file))
 
-    from tsdf.data import format
+    from tsdf.data import format as tsdf_format
     from tsdf.loaders import export
     from tsdf.loaders.pointmedium import point_medium
     from tsdf.scene.deep import absorption_of_colour
     from tsdf.scene.scene import Absorption, absorbing_material
 
-    table = format.read(file)
+    table = tsdf_format.read(file)
     grains = in_words(table, words, unit)
     packing, radius = grains.fraction, grains.radius
     products = times_radius(absorption, radius, unit, colours=True)
@@ -100,10 +132,8 @@ def main(
     measured = export.level_errors(medium, export.SLAB * radius) if measure else None
     told = [grains.summary()]
     if colour:
-        asked = (
-            f"colour {plain(deep_colour)} where {'deep' if colour_thickness is None else f'{colour_thickness:g} thick'}"
-        )
-        told.append(f"{asked}: absorption {conventions(products, radius, unit)}")
+        body = "deep" if colour_thickness is None else f"{colour_thickness:g} thick"
+        told.append(f"colour {plain(deep_colour)} where {body}: absorption {conventions(products, radius, unit)}")
     deep = math.inf if thickness is None else thickness
     request = export.Request(medium, lobes, kept, deep, measured, tuple(told))
     if to == "npz":

@@ -61,7 +61,7 @@ def main(
     with a colour, the absorption that gives it.
     """
     from tsdf.cli.absorption import times_radius
-    from tsdf.data import format
+    from tsdf.data import format as tsdf_format
     from tsdf.errors import UsageError
     from tsdf.scene.sizes import SIZES
 
@@ -76,7 +76,7 @@ def main(
             raise UsageError(f"{name} is of a colour: give --deep-colour too")
     if absorption is not None and not any(word in words for word in SIZES):
         times_radius(absorption, None, unit)  # before anything is read
-    table = format.read(file)
+    table = tsdf_format.read(file)
     grains = in_words(table, words, unit, amount_needed=False)
     radius = grains.radius if any(word in words for word in SIZES) else None
     (product,) = times_radius(absorption, radius, unit)

@@ -57,8 +57,10 @@ def main(
     from tsdf.study import spectra
 
     with working(quiet) as work:
-        family, found, size = asked.scattering(work.progress)
-    c = found.constants
+        c = asked.constants()
+        family = asked.family(c, work.progress)
+    words = asked.words(family)
+    found, size = spectra.spectrum(family, c, words.radius), asked.told(words)
     notes = [
         f"single scattering of {family.tables[0].header['grain']['name']}, {c.material} ({c.source}), {size}",
         f"tables at n = {', '.join(f'{eta:.5g}' for eta in family.eta)}; polynomials between them may miss "

@@ -21,6 +21,6 @@ def main(file: str, out: str) -> None:
 
     plots.check_suffix(out)
     check_output(Path(out), Path(file))
-    from tsdf.data import format
+    from tsdf.data import format as tsdf_format
 
-    plots.save(plots.plot_table(format.read(file)), out)
+    plots.save(plots.plot_table(tsdf_format.read(file)), out)

@@ -68,7 +68,8 @@ def main(
         raise UsageError("--spp, --seconds and --target-error each say when to stop: give one")
 
     from tsdf.picture import image, leaping, render, world
-    from tsdf.scene.scene import MAX_EXPLICIT, files_of, load, resized
+    from tsdf.scene.scene import MAX_EXPLICIT, load, resized
+    from tsdf.scene.specs import files_of
 
     if leap is not None:
         leaping.checked(leap, "--leap")

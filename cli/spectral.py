@@ -19,7 +19,8 @@ from tsdf.errors import UsageError
 if TYPE_CHECKING:
     import numpy as np
 
-    from tsdf.study.spectra import Family, Spectrum
+    from tsdf.scene.sizes import InWords
+    from tsdf.study.spectra import Constants, Family
 
 SUFFIX = ".exr"  # of tables; all else is a grain
 DEFAULT_SIZE = ("effective_radius", 2e-4)  # [m] where nothing is said: old snow
@@ -120,60 +121,74 @@ class Asked(NamedTuple):
     def mesh(self) -> Path | None:
         """The file of a grain that is not built in, None where a table or a built-in grain is given."""
         path = Path(self.grains[0])
-        return path if not self.grains[0].lower().endswith(SUFFIX) and path.is_file() else None
+        return path if not self.tabulated and path.is_file() else None
 
     @property
     def inputs(self) -> list[Path]:
         """All that is read."""
         return [Path(name) for name in (*self.grains, self.material)]
 
-    def scattering(
-        self, told: Callable[[float, str], None], seed: int = 0, **records: int
-    ) -> tuple["Family", "Spectrum", str]:
-        """Return tables, what their grains do to light by wavelength, and their size in all words.
+    def constants(self) -> "Constants":
+        """Return optical constants at the wavelengths.
 
         Raises
         ------
         UsageError, TSDFError
         """
-        from tsdf.data import format
         from tsdf.grain.constants import constants_over
-        from tsdf.grain.grains import load_grain
-        from tsdf.make.scatterometer import Effort
-        from tsdf.scene.sizes import DENSITIES, convert
         from tsdf.study import spectra
 
-        constants = spectra.Constants.of(constants_over(self.material, spectra.wavelengths(self.wavelength_nm)))
-        if self.grains[0].lower().endswith(SUFFIX):
-            family = spectra.Family.of([format.read(Path(name)) for name in self.grains])
-        else:
-            grain = load_grain(self.grains[0], False, **self.settings)
-            paths = None if grain.kind == "sphere" else self.table_paths
-            effort = Effort(paths, seed=seed, **records)
-            family = spectra.build(grain, constants.n, effort, threads=self.threads, told=told)
-        said = {**self.sizes, "packing_fraction": 0.5}
+        return spectra.Constants.of(constants_over(self.material, spectra.wavelengths(self.wavelength_nm)))
+
+    def family(
+        self, constants: "Constants | None", told: Callable[[float, str], None], seed: int = 0, **records: int
+    ) -> "Family":
+        """Return the tables that are given, or tables of the grain at the indices that are needed.
+
+        Raises
+        ------
+        UsageError, TSDFError
+        """
+        from tsdf.data import format as tsdf_format
+        from tsdf.grain.grains import load_grain
+        from tsdf.make.scatterometer import Effort
+        from tsdf.study import spectra
+
+        if self.tabulated:
+            return spectra.Family.of([tsdf_format.read(Path(name)) for name in self.grains])
+        assert constants is not None
+        grain = load_grain(self.grains[0], False, **self.settings)
+        paths = None if grain.kind == "sphere" else self.table_paths
+        effort = Effort(paths, seed=seed, **records)
+        return spectra.build(grain, constants.n, effort, threads=self.threads, told=told)
+
+    @property
+    def tabulated(self) -> bool:
+        """Whether tables are given, and no grain."""
+        return self.grains[0].lower().endswith(SUFFIX)
+
+    def words(self, family: "Family", density: Mapping[str, float] | None = None, **amount: float) -> "InWords":
+        """Return sizes in metres, and how much of space is filled where that is said.
+
+        `density` may hold that of the solid.
+
+        Raises
+        ------
+        UsageError
+        """
+        from tsdf.scene.sizes import DENSITIES, MATERIAL_DENSITY, convert
+
+        said = dict(self.sizes) | dict(density or {}) | amount
         if self.material in DENSITIES:
-            said["material_density"] = DENSITIES[self.material]
-        packed = convert([(family.tables[0], 1.0)], said, metres_per_unit=1.0)
-        words = {"radius": "R {:.4g} m", "effective_radius": "effective radius {:.4g} m", "ssa": "SSA {:.4g} m2/kg"}
-        facts = packed.facts()
-        size = ", ".join(form.format(facts[name]) for name, form in words.items() if facts[name] is not None)
-        if self.sizes == dict([DEFAULT_SIZE]):
-            size += " (by default)"
-        return family, spectra.spectrum(family, constants, packed.radius), size
+            said = {MATERIAL_DENSITY: DENSITIES[self.material]} | said
+        return convert([(family.tables[0], 1.0)], said, 1.0, amount_needed=bool(amount))
 
-
-def packing_of(family: "Family", material: str, density: float) -> float:
-    """Return the packing fraction at which the medium has a density [kg/m^3].
-
-    Raises
-    ------
-    UsageError
-    """
-    from tsdf.scene.sizes import DENSITIES, convert
-
-    said = {"density": density} | ({"material_density": DENSITIES[material]} if material in DENSITIES else {})
-    return convert([(family.tables[0], 1.0)], said).packing_fraction
+    def told(self, words: "InWords") -> str:
+        """Return how large grains are, for notes."""
+        forms = {"radius": "R {:.4g} m", "effective_radius": "effective radius {:.4g} m", "ssa": "SSA {:.4g} m2/kg"}
+        facts = words.facts()
+        size = ", ".join(form.format(facts[name]) for name, form in forms.items() if facts[name] is not None)
+        return size + (" (by default)" if self.sizes == dict([DEFAULT_SIZE]) else "")
 
 
 def check(asked: Asked, *outputs: Path | None) -> None:

@@ -93,7 +93,7 @@ def files(folder: Path) -> None:
     import OpenEXR
     import trimesh
 
-    from tsdf.data import format
+    from tsdf.data import format as tsdf_format
     from tsdf.grain.grains import load_grain
     from tsdf.grain.optics import Optics
     from tsdf.make.scatterometer import Effort, exact_sphere
@@ -107,8 +107,10 @@ def files(folder: Path) -> None:
     trimesh.creation.box((2.0, 1.0, 2.0)).export(folder / "heap.ply")
     trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).export(folder / "open.ply")
     effort = Effort(cells=32, joint=4, memory=8)
-    format.write(exact_sphere(load_grain("sphere"), Optics(1.33), effort), folder / "ball.tsdf.exr")
-    format.write(exact_sphere(load_grain("sphere"), Optics(1.5), Effort(cells=16, joint=0)), folder / "plain.tsdf.exr")
+    tsdf_format.write(exact_sphere(load_grain("sphere"), Optics(1.33), effort), folder / "ball.tsdf.exr")
+    tsdf_format.write(
+        exact_sphere(load_grain("sphere"), Optics(1.5), Effort(cells=16, joint=0)), folder / "plain.tsdf.exr"
+    )
     (folder / "text.txt").write_text("no image, mesh or table\n")
     os.mkfifo(folder / "pipe")
 

@@ -32,8 +32,6 @@ from tsdf.picture import image
 from tsdf.scene.scene import Absorption
 from tsdf.walk.lights import LUMINANCE
 
-ENOUGH = 0.02  # [1] total variation up to which one lobe is taken where a target could mix two
-BETTER = 0.9  # [1] of the error of one lobe, which two must stay below
 SLAB = 40.0  # [R] thickness at which levels are measured
 LEVELS = ("volume-hg", "volume", "teleport")
 

@@ -8,12 +8,14 @@ import numpy as np
 
 from tsdf.data.table import Table
 from tsdf.errors import UsageError
-from tsdf.loaders.export import BETTER, ENOUGH
 from tsdf.picture import image
 from tsdf.scene.medium import Component, VolumeParameters, volume_parameters
-from tsdf.scene.scene import Absorption, absorption_at
+from tsdf.scene.scene import Absorption
+from tsdf.scene.specs import absorption_at
 from tsdf.walk.lights import LUMINANCE
 
+ENOUGH = 0.02  # [1] total variation up to which one lobe is taken where a target could mix two
+BETTER = 0.9  # [1] of the error of one lobe, which two must stay below
 MOST_BOUNCES = 1024  # Cycles' own limit
 DEEP = 4000.0  # [transport mean free paths] from which on a body counts as deep
 MODES = 20_000  # of the diffusion equation in a slab

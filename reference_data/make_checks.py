@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.data.table import thawed
 from tsdf.reference_data.make_golden import Header, file
 
@@ -56,14 +56,14 @@ def bases() -> None:
         tables[name] = assemble.traced_table(tally, cells, shape, Optics(eta), traced, memory)
     CHECKS.mkdir(parents=True, exist_ok=True)
     for name, table in tables.items():
-        format.write(table, CHECKS / f"{name}.tsdf.exr")
+        tsdf_format.write(table, CHECKS / f"{name}.tsdf.exr")
 
 
 class Change:
     """A copy of a sound table, to be changed."""
 
     def __init__(self, base: str) -> None:
-        table = format.read(CHECKS / f"{base}.tsdf.exr")
+        table = tsdf_format.read(CHECKS / f"{base}.tsdf.exr")
         self.header: Header = copy.deepcopy(thawed(table.header))
         del self.header["pixels_sha256"]  # `file` computes it
         self.pixels = np.array(table.pixels)

@@ -92,6 +92,23 @@ def test_no_circle() -> None:
     assert circle({named(path): own(path) for path in modules()}) == []
 
 
+@pytest.mark.parametrize("room", ["cli", "loaders"])
+def test_no_circle_outside(room: str) -> None:
+    """Nor do those that stand beside the package."""
+    names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in (ROOT / room).rglob("*.py")}
+    arrows = {
+        name: {
+            target
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"tsdf.{room}")
+            for target in [node.module[5:], *(f"{node.module[5:]}.{alias.name}" for alias in node.names)]
+            if target in names
+        }
+        for name, path in names.items()
+    }
+    assert any(arrows.values()) and circle(arrows) == []
+
+
 def test_the_judge_does_not_import_the_judged() -> None:
     """`analytic` says what the answer should be, so it shares no more with what computes it than errors and numba."""
     assert own(PACKAGE / "judge/analytic.py") == {"errors", "compiled"}
@@ -119,7 +136,7 @@ def test_what_a_kernel_is_made_of(path: Path) -> None:
     assert imported(named(path)) == found
 
 
-LONG = {"tsdf/walk/transport.py", "tsdf/judge/analytic.py", "tsdf/scene/scene.py"}  # the kernels of light, the judge
+LONG = {"tsdf/walk/transport.py", "tsdf/judge/analytic.py"}  # the kernels of light, the judge
 
 
 def sources() -> list[Path]:

@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from tsdf.grain.grains import load_grain as load_grain
     from tsdf.grain.optics import Optics as Optics
     from tsdf.make.build import build as build
-    from tsdf.make.scatterometer import Effort as Effort
+    from tsdf.make.effort import Effort as Effort
     from tsdf.picture.shot import render as render
     from tsdf.scene.scene import load as load_scene
 
     __version__: str
 
 _HOMES = {
-    "Effort": "make.scatterometer:Effort",
+    "Effort": "make.effort:Effort",
     "FormatError": "errors:FormatError",
     "Optics": "grain.optics:Optics",
     "Sampler": "data.sampler:Sampler",

@@ -1,4 +1,4 @@
-"""The door to numba: kernels, and where their machine code is kept between runs.
+"""Compiled kernels: the door to numba, and where machine code is kept between runs.
 
 numba's own cache knows a kernel by the text of its file, not by that of the kernels it calls, so an upgrade that
 changes only those would leave old code running. Here a kernel is known by its file and all that this imports of the

@@ -1,4 +1,4 @@
-"""One pointer for kernels to all that they share: structures of arrays, opened where they are used.
+"""Handles: one pointer for kernels to all that they share, structures of arrays, opened where they are used.
 
 numba passes a NamedTuple of arrays by value, word by word, on every call that it does not inline. A `Handle` lays one
 out in memory, a 64-bit word for each number and the address and shape of each array, and kernels are passed where that

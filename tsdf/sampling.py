@@ -1,4 +1,4 @@
-"""Random numbers that are functions of what they are for: hashes, scrambled Sobol' points, points on a circle.
+"""Sampling: random numbers as functions of what they are for; hashes, scrambled Sobol' points, points on a circle.
 
 numba kernels; uint64 keys stand for random streams. Nothing here keeps a state, so the order of use does not matter.
 """

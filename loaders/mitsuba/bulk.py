@@ -1,5 +1,6 @@
 """Bulk of grains: what a medium is made of, as the stock medium (`medium`) and as parameters of ``granular``."""
 
+import difflib
 import math
 import os
 from collections.abc import Sequence
@@ -10,9 +11,13 @@ import numpy as np
 from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
 from tsdf.errors import TSDFError, UsageError
+from tsdf.scene.deep import absorption_of_colour
 from tsdf.scene.medium import Component, free_path, volume_parameters
+from tsdf.scene.sizes import SIZES, WORDS, convert
 
 MAX_NODES = 4097  # of a tabulated phase function
+COLOURS = ("albedo", "deep_colour")  # two words for the colour of a deep medium in diffuse light
+LENGTH_OF_UNIT = "metres_per_unit"  # [m]; only ssa needs it
 
 
 class Grain(NamedTuple):
@@ -21,6 +26,7 @@ class Grain(NamedTuple):
     table: Table | str | os.PathLike[str]
     fraction: float = 1.0  # share of the number of grains [1]
     absorption: float | Sequence[float] = 0.0  # sigma_a of its material, one number or RGB [1/scene unit]
+    deep_colour: float | Sequence[float] | None = None  # of a deep medium of these grains, instead of the absorption
 
 
 Grains = Table | str | os.PathLike[str] | Sequence[Grain]
@@ -38,13 +44,35 @@ def _table(table: Table | str | os.PathLike[str]) -> Table:
     return tsdf_format.read(name)
 
 
-def _colour(value: Any) -> tuple[float, float, float]:
+def _in_numbers(
+    grains: Sequence[tuple[Table, float]], packing_fraction: float | None, radius: float | None, said: dict[str, Any]
+) -> tuple[float, float]:
+    """Return packing fraction and bounding radius, whatever words say them."""
+    if packing_fraction is not None and radius is not None and not said:
+        return float(packing_fraction), float(radius)
+    ours = {"packing_fraction": packing_fraction, "radius": radius}
+    words = {word: value for word, value in ours.items() if value is not None} | said
+    metres = words.pop(LENGTH_OF_UNIT, None)
+    try:
+        numbers = {word: float(value) for word, value in words.items()}
+        unit = None if metres is None else float(metres)
+    except (TypeError, ValueError):
+        raise UsageError(f"sizes and amounts are numbers, not {words!r}") from None
+    if not any(word in numbers for word in SIZES):
+        raise UsageError(f"how large grains are is missing: give grain_radius, or one of {', '.join(SIZES)}")
+    packed = convert(grains, numbers, unit)
+    return packed.fraction, packed.radius
+
+
+def _colour(
+    value: Any, wanted: str = "absorption must be one finite number >= 0 [1/scene unit] or three for RGB"
+) -> tuple[float, float, float]:
     try:
         numbers = [float(value)] * 3 if np.ndim(value) == 0 else [float(v) for v in value]
     except (TypeError, ValueError):
         numbers = []
     if len(numbers) != 3 or not all(0.0 <= v < math.inf for v in numbers):
-        raise UsageError(f"absorption must be one finite number >= 0 [1/scene unit] or three for RGB, not {value!r}")
+        raise UsageError(f"{wanted}, not {value!r}")
     return numbers[0], numbers[1], numbers[2]
 
 
@@ -60,25 +88,53 @@ class Bulk:
         Bounding radius R [scene unit].
     absorption : float or (3,) float
         Absorption coefficient of the material [1/scene unit]; of a mixture, each grain has its own.
+    **said
+        `deep_colour` or `albedo`, one number or linear RGB, in place of the absorption: the colour of a deep medium in
+        diffuse light (`tsdf.scene.deep`). Any of `tsdf.scene.sizes.WORDS` in place of packing_fraction and
+        grain_radius, with `metres_per_unit` for ssa.
 
     Raises
     ------
     UsageError
-        For a value out of range.
+        For a value out of range, and for words that are unknown or say a thing twice.
     FormatError
         For a file that is not a table, or of a newer version.
     """
 
-    def __init__(self, grains: Grains, packing_fraction: float, grain_radius: float, absorption: Any = 0.0) -> None:
+    def __init__(
+        self,
+        grains: Grains,
+        packing_fraction: float | None = None,
+        grain_radius: float | None = None,
+        absorption: Any = 0.0,
+        **said: Any,
+    ) -> None:
+        colours = [said.pop(word) for word in COLOURS if word in said]
+        if len(colours) + (bool(colours) and bool(np.any(np.asarray(absorption) != 0.0))) > 1:
+            raise UsageError("absorption, albedo and deep_colour all say how grains absorb: give one")
         if isinstance(grains, Table | str | os.PathLike):
-            grains = [Grain(grains, 1.0, absorption)]
-        elif np.any(np.asarray(absorption) != 0.0):
+            grains = [Grain(grains, 1.0, absorption, *colours)]
+        elif colours or np.any(np.asarray(absorption) != 0.0):
             raise UsageError("the grains of a mixture have their own absorption: Grain(table, fraction, absorption)")
         grains = [Grain(*g) for g in grains]
-        self.components = [Component(_table(g.table), float(g.fraction), float(grain_radius)) for g in grains]
-        self.sigma_a = np.array([_colour(g.absorption) for g in grains])  # (components, 3)
-        self.packing_fraction, self.radius = float(packing_fraction), float(grain_radius)
+        tables = [_table(g.table) for g in grains]
+        self.packing_fraction, self.radius = _in_numbers(
+            [(t, float(g.fraction)) for t, g in zip(tables, grains, strict=True)], packing_fraction, grain_radius, said
+        )
+        self.grains = grains
+        self.components = [Component(t, float(g.fraction), self.radius) for t, g in zip(tables, grains, strict=True)]
+        self.sigma_a = np.array(
+            [self._absorption(g, t) for g, t in zip(grains, tables, strict=True)]
+        )  # (components, 3)
         self.path = free_path(self.components, self.packing_fraction)
+
+    def _absorption(self, grain: Grain, table: Table) -> tuple[float, float, float]:
+        """Return the absorption coefficient of a grain's material, red, green, blue [1/scene unit]."""
+        if grain.deep_colour is None:
+            return _colour(grain.absorption)
+        asked = _colour(grain.deep_colour, "deep_colour must be one number or three for RGB, > 0 and < 1")
+        red, green, blue = (x / self.radius for x in absorption_of_colour(table, asked))
+        return red, green, blue
 
     def phase(self) -> np.ndarray:
         """Return the phase function as values at uniformly spaced cosines, (n,) float64 from -1 to 1, mean density 1.
@@ -157,7 +213,11 @@ def _shared_out(edges: np.ndarray, masses: np.ndarray, x: np.ndarray) -> np.ndar
 
 
 def medium(
-    table: Grains, packing_fraction: float, grain_radius: float, absorption: float | Sequence[float] = 0.0
+    table: Grains,
+    packing_fraction: float | None = None,
+    grain_radius: float | None = None,
+    absorption: float | Sequence[float] = 0.0,
+    **said: Any,
 ) -> dict[str, Any]:
     """Return the stock ``homogeneous`` medium with ``tabphase`` that stands for grains, for the stock ``volpath``.
 
@@ -170,6 +230,8 @@ def medium(
         Bounding radius R [scene unit].
     absorption : float or (3,) float
         Absorption coefficient sigma_a of the material [1/scene unit], one number or linear RGB.
+    **said
+        Other words for these: see `Bulk`.
 
     Returns
     -------
@@ -183,18 +245,21 @@ def medium(
     UsageError, FormatError
         As `Bulk`.
     """
-    return Bulk(table, packing_fraction, grain_radius, absorption).stock()
+    return Bulk(table, packing_fraction, grain_radius, absorption, **said).stock()
 
 
 def granular(
-    table: Grains, packing_fraction: float, grain_radius: float, absorption: float | Sequence[float] = 0.0
+    table: Grains,
+    packing_fraction: float | None = None,
+    grain_radius: float | None = None,
+    absorption: float | Sequence[float] = 0.0,
+    **said: Any,
 ) -> dict[str, Any]:
     """Return the dict of the medium ``granular`` for the integrator ``tpt``; parameters and errors as `medium`.
 
     Tables in memory are named by a handle that is good for this process.
     """
-    Bulk(table, packing_fraction, grain_radius, absorption)
-    grains = [Grain(table, 1.0, absorption)] if isinstance(table, Table | str | os.PathLike) else table
+    bulk = Bulk(table, packing_fraction, grain_radius, absorption, **said)
 
     def name(of: Table | str | os.PathLike[str]) -> str:
         if not isinstance(of, Table):
@@ -204,22 +269,26 @@ def granular(
 
     return {
         "type": "granular",
-        "file": ";".join(name(g.table) for g in grains),
-        "fraction": ";".join(repr(float(g.fraction)) for g in grains),
-        "absorption": ";".join(" ".join(map(repr, _colour(g.absorption))) for g in grains),
-        "packing_fraction": float(packing_fraction),
-        "grain_radius": float(grain_radius),
+        "file": ";".join(name(g.table) for g in bulk.grains),
+        "fraction": ";".join(repr(float(g.fraction)) for g in bulk.grains),
+        "absorption": ";".join(" ".join(map(repr, sigma.tolist())) for sigma in bulk.sigma_a),
+        "packing_fraction": bulk.packing_fraction,
+        "grain_radius": bulk.radius,
     }
 
 
 def bulk_of(props: Any) -> Bulk:
     """Return what the properties of a ``granular`` medium say."""
     where = f"medium granular {props.id()!r}"
-    known = {"file", "fraction", "absorption", "packing_fraction", "grain_radius"}
+    words = {*WORDS, LENGTH_OF_UNIT} - {"radius", "packing_fraction"}
+    known = {"file", "fraction", "absorption", "packing_fraction", "grain_radius", *COLOURS, *words}
     for key in list(props.keys()):
         if key not in known:
-            raise UsageError(f"{where}: unknown parameter {key!r}; it knows {', '.join(sorted(known))}")
-    for key in ("file", "packing_fraction", "grain_radius"):
+            near = difflib.get_close_matches(key, sorted(known), 1)
+            hint = f"did you mean {near[0]!r}? " if near else ""
+            raise UsageError(f"{where}: unknown parameter {key!r}; {hint}it knows {', '.join(sorted(known))}")
+    said = {key: props[key] for key in sorted(words) if key in props}
+    for key in ("file",) if said else ("file", "packing_fraction", "grain_radius"):
         if key not in props:
             raise UsageError(f"{where}: {key} is missing")
     files = [name.strip() for name in props["file"].split(";")]
@@ -237,8 +306,13 @@ def bulk_of(props: Any) -> Bulk:
             raise UsageError(f"{where}: {key} is for {len(numbers)} tables, file names {len(files)}")
         return [v[0] if len(v) == 1 else v for v in numbers]
 
-    grains = [Grain(*g) for g in zip(files, several("fraction", "1"), several("absorption", "0"), strict=True)]
+    asked = [key for key in COLOURS if key in props]
+    if len(asked) + ("absorption" in props) > 1 and asked:
+        raise UsageError(f"{where}: absorption, albedo and deep_colour all say how grains absorb: give one")
+    colours = several(asked[0], "") if asked else [None] * len(files)
+    columns = (files, several("fraction", "1"), several("absorption", "0"), colours)
+    grains = [Grain(*g) for g in zip(*columns, strict=True)]
     try:
-        return Bulk(grains, props["packing_fraction"], props["grain_radius"])
+        return Bulk(grains, props.get("packing_fraction"), props.get("grain_radius"), **said)
     except TSDFError as error:
         raise type(error)(f"{where}: {error}") if not hasattr(error, "code") else error from None

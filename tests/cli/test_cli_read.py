@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from tsdf.cli import info, plot, validate
 from tsdf.cli.common import Tool, plain
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.errors import FormatWarning, TSDFError, UsageError
 from tsdf.reference_data.make_checks import CHECKS
 from tsdf.scene.deep import deep_colour
@@ -42,7 +42,7 @@ def fails(result, status, *parts):
 def test_info_json_says_what_the_header_says():
     result = run(info, CUBE, "--json")
     assert (result.exit_code, result.stderr) == (0, "")
-    facts, table = json.loads(result.stdout), format.read(CUBE)
+    facts, table = json.loads(result.stdout), tsdf_format.read(CUBE)
     assert (facts["grain"], facts["kind"], facts["eta"], facts["fresnel"]) == ("cube", "mesh", 1.31, "un")
     assert facts["cells"] == {"cos_theta": 16, "p_phi": 32, "p_r": 64, "p_z": 96, "p_l": len(table.p_l)}
     for name, value in table.statistics.items():
@@ -59,7 +59,7 @@ def test_info_json_says_what_the_header_says():
 def test_info_for_people():
     result = run(info, CUBE)
     assert (result.exit_code, result.stderr) == (0, "")
-    table = format.read(CUBE)
+    table = tsdf_format.read(CUBE)
     for text in (f"{table.statistics['mean_z']:.6f} +- ", "Henyey-Greenstein", "scattered", "eta", "131072 paths"):
         assert text in result.stdout
     assert "exact" in run(info, SPHERE).stdout
@@ -90,7 +90,7 @@ def test_info_of_a_colour():
     options = ("--deep-colour", "0.9,0.5,0.2", "--radius", "2", "--unit", "1e-3")
     colour = json.loads(run(info, SPHERE, "--json", *options).stdout)["colour"]
     by_radius = colour["absorption_times_radius"]
-    assert [deep_colour(format.read(SPHERE), x) for x in by_radius] == pytest.approx([0.9, 0.5, 0.2], abs=1e-6)
+    assert [deep_colour(tsdf_format.read(SPHERE), x) for x in by_radius] == pytest.approx([0.9, 0.5, 0.2], abs=1e-6)
     assert colour["absorption"] == pytest.approx([x / 2.0 for x in by_radius])
     assert colour["absorption_per_metre"] == pytest.approx([x / 2e-3 for x in by_radius])
     units = {"R": 1.0, "unit": 2.0, "m": 2e-3}
@@ -105,8 +105,8 @@ def test_info_of_a_colour():
 def test_absorption_changes_albedo_and_mean_cosine_only():
     facts = json.loads(run(info, SPHERE, "--json", "--absorption", "0.1/R").stdout)
     lossless = json.loads(run(info, SPHERE, "--json").stdout)
-    assert facts["albedo"] == format.read(SPHERE).albedo(0.1) == pytest.approx(0.847, abs=0.001)
-    assert facts["mean_cosine"] == format.read(SPHERE).mean_cosine(0.1) > lossless["mean_cosine"]
+    assert facts["albedo"] == tsdf_format.read(SPHERE).albedo(0.1) == pytest.approx(0.847, abs=0.001)
+    assert facts["mean_cosine"] == tsdf_format.read(SPHERE).mean_cosine(0.1) > lossless["mean_cosine"]
     assert (facts["absorption_times_radius"], facts["absorption"]) == (0.1, None)
     assert facts["mean_z"] == lossless["mean_z"]
     assert facts["standard_errors"]["albedo"] is None
@@ -132,7 +132,7 @@ def test_absorption_has_a_unit(given, options, product):
     facts = json.loads(result.stdout)
     assert result.stderr == ""
     assert facts["absorption_times_radius"] == pytest.approx(product, rel=1e-12)
-    assert facts["albedo"] == pytest.approx(format.read(SPHERE).albedo(product), rel=1e-12)
+    assert facts["albedo"] == pytest.approx(tsdf_format.read(SPHERE).albedo(product), rel=1e-12)
     text = run(info, SPHERE, "--absorption", given, *options).stdout
     radius = dict(zip(options[::2], options[1::2], strict=True)).get("--radius")
     assert f"absorption           {product:g} / R" in text
@@ -169,7 +169,7 @@ def test_medium_of_packed_grains():
     from tsdf.scene.medium import Component, free_path, volume_parameters
 
     facts = json.loads(run(info, CUBE, "--json", "--packing", "0.6", "--absorption", "0.1/R").stdout)["medium"]
-    grains = [Component(format.read(CUBE))]
+    grains = [Component(tsdf_format.read(CUBE))]
     path, volume = free_path(grains, 0.6), volume_parameters(grains, 0.6, [0.1])
     lengths = {"lambda_b": path.lambda_b, "lambda_beta": path.lambda_beta, "lambda_s": path.lambda_s}
     lengths["transport_mean_free_path"] = volume.transport_mean_free_path
@@ -225,11 +225,11 @@ def test_medium_that_cannot_be(options, parts):
 def test_text_of_a_file_is_escaped(tmp_path):
     from tsdf.data.table import Table, thawed
 
-    table = format.read(CUBE)
+    table = tsdf_format.read(CUBE)
     header = thawed(table.header)
     header["grain"]["name"] = "salt\u202e"
     path = tmp_path / "a.tsdf.exr"
-    format.write(Table(header, table.pixels), path)
+    tsdf_format.write(Table(header, table.pixels), path)
     result = run(info, path)
     assert result.exit_code == 0 and "\x1b" not in result.stdout and r"salt\u202e" in result.stdout
 

@@ -359,6 +359,17 @@ def test_every_truncation_is_refused() -> None:
         assert all(codes(data[:length]) for length in range(len(data)))
 
 
+@pytest.mark.parametrize(("name", "code"), [("p_theta", "VALUE_P_THETA_SUM"), ("p_r", "VALUE_COLUMN_SUM")])
+@pytest.mark.parametrize("excess", [-2e-5, -5e-6, 5e-6, 2e-5])
+def test_masses_sum_to_one_as_closely_as_said(name: str, code: str, excess: float) -> None:
+    """SPEC.md says 1e-5."""
+    header, pixels = make_golden.table(make_golden.WEIGHTS)
+    (block,) = (block for block in header["blocks"] if block["name"] == name)
+    rows = slice(block["first_row"], block["first_row"] + block["rows"])
+    pixels[rows] = pixels[rows].astype(np.float64) * (1.0 + excess)
+    assert codes(make_golden.file(header, pixels)) == [code] * (abs(excess) > 1e-5)
+
+
 @pytest.mark.slow
 def test_every_flipped_bit_is_refused(capfd: pytest.CaptureFixture[str]) -> None:
     """No bit may be flipped and the file still be taken for a table, unused places included.

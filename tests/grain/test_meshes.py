@@ -562,6 +562,29 @@ def test_dae_without_its_package(tmp_path, monkeypatch):
     refused("needs the package pycollada; pip install pycollada", tmp_path, "box.dae", FILES["box.dae"])
 
 
+@pytest.mark.parametrize("order", ["Little", "Big"])
+@pytest.mark.parametrize("width", [32, 64])
+def test_vtk_of_either_byte_order(order, width, tmp_path):
+    """Binary arrays of the XML form, with their sizes as UInt32 or UInt64; read the wrong way they are of no size."""
+    sign = "<" if order == "Little" else ">"
+
+    def array(name, kind, values, components=1):
+        data = np.asarray(values, sign + {"Float32": "f4", "Int32": "i4"}[kind]).tobytes()
+        coded = base64.b64encode(np.array(len(data), f"{sign}u{width // 8}").tobytes() + data).decode()
+        more = f'NumberOfComponents="{components}" format="binary"'
+        return f'<DataArray type="{kind}" Name="{name}" {more}>{coded}</DataArray>'
+
+    ends = np.cumsum([len(face) for face in L_FACES])
+    text = f"""<VTKFile type="PolyData" byte_order="{order}Endian" header_type="UInt{width}"><PolyData>
+<Piece NumberOfPoints="{len(L_POINTS)}" NumberOfPolys="{len(L_FACES)}">
+<Points>{array("Points", "Float32", np.ravel(L_POINTS), 3)}</Points>
+<Polys>{array("connectivity", "Int32", np.concatenate(L_FACES))}{array("offsets", "Int32", ends)}</Polys>
+</Piece></PolyData></VTKFile>"""
+    assert size(loaded(tmp_path, "l.vtp", text)) == pytest.approx((3.0, 14.0))
+    other = {"Little": "Big", "Big": "Little"}[order]
+    refused("not a|an array of", tmp_path, "other.vtp", text.replace(f"{order}Endian", f"{other}Endian"))
+
+
 def test_vtk_refused_by_name(tmp_path):
     grid = FILES["grid.vtk"].replace(struct.pack(">6i", *[9] * 6), struct.pack(">6i", *[9] * 5, 10))
     refused("VTK type 10, volumes", tmp_path, "tets.vtk", grid)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table, thawed
 from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
@@ -47,7 +47,7 @@ def errors(table: Table) -> set[str]:
 
 
 def base(name: str) -> Table:
-    return format.read(CHECKS / f"{name}.tsdf.exr")
+    return tsdf_format.read(CHECKS / f"{name}.tsdf.exr")
 
 
 # --- the golden files ---------------------------------------------------------------
@@ -77,7 +77,7 @@ def test_each_fault_is_found(name):
 def test_the_codes_are_a_closed_set():
     """Each code has a golden file, each golden file a code, and SPEC.md lists them all as they are."""
     assert {name.partition("-")[0] for name in FAULTS} == set(CODES)
-    assert not set(CODES) & set(format.CODES)
+    assert not set(CODES) & set(tsdf_format.CODES)
     annex = resources.files("tsdf.schema").joinpath("SPEC.md").read_text("utf-8").partition("## Annex A")[2]
     assert dict(re.findall(r"^\| `([A-Z_]+)` \| (\w+ \| .*?) \|$", annex, re.M)) == {
         code: f"{severity} | {rule}" for code, (severity, rule) in CODES.items()

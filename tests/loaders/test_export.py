@@ -29,13 +29,14 @@ from tsdf.errors import FormatWarning
 from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
 from tsdf.loaders import export
-from tsdf.loaders.pointmedium import MOST_BOUNCES, PointMedium, bounces, lost, point_medium
+from tsdf.loaders.pointmedium import ENOUGH, MOST_BOUNCES, PointMedium, bounces, lost, point_medium
 from tsdf.make import scatterometer
 from tsdf.make.scatterometer import Effort
 from tsdf.picture import image
 from tsdf.reference_data.make_checks import CHECKS
 from tsdf.scene.medium import Component, volume_parameters
-from tsdf.scene.scene import Absorption, absorption_at
+from tsdf.scene.scene import Absorption
+from tsdf.scene.specs import absorption_at
 
 CUBE = CHECKS / "cube.tsdf.exr"
 SIGMAS = 4.0
@@ -220,7 +221,7 @@ def test_units() -> None:
 def test_two_lobes_only_where_needed(cube: Table) -> None:
     """One lobe where the fit is good, two where it is not and they are better."""
     medium = point_medium(cube, 0.6, 1.0)
-    assert cube.header["fits"]["henyey_greenstein"]["total_variation"] > export.ENOUGH
+    assert cube.header["fits"]["henyey_greenstein"]["total_variation"] > ENOUGH
     assert len(medium.lobes()) == 2 and len(medium.lobes(1)) == 1
     header = dict(cube.header)
     header["fits"] = dict(header["fits"]) | {"henyey_greenstein": {"g": 0.4, "total_variation": 0.01}}
@@ -490,12 +491,11 @@ def test_sizes_densities_and_colours_in_any_word(cube: Table, tmp_path: Path) ->
     xs = absorption_of_colour(cube, (0.9, 0.5, 0.2))
     ours = ("--radius", 0.5, "--packing", 0.6, "--absorption", ",".join(map(repr, xs)) + "/R")
     theirs = ("--effective-radius", facts["effective_radius"], "--solid-fraction", facts["solid_fraction"])
-    a, b = (
-        run("--to", "pbrt", *words) for words in (ours, (*theirs, "--deep-colour", "0.9,0.5,0.2", "--unit", "0.001"))
-    )
+    theirs += ("--deep-colour", "0.9,0.5,0.2", "--unit", "0.001")
+    a, b = (run("--to", "pbrt", *words) for words in (ours, theirs))
     assert b.exit_code == 0, b.stderr
-    for x, y in zip(pbrt_medium(a.stdout).values(), pbrt_medium(b.stdout).values(), strict=True):
-        assert y == (pytest.approx(x, rel=1e-6) if not isinstance(x, str) else x)
+    for x, y in zip(pbrt_medium(a.stdout), pbrt_medium(b.stdout), strict=True):
+        assert y == pytest.approx(x, rel=1e-5)
     for part in ("effective_radius", "solid_fraction", "colour 0.9,0.5,0.2 where deep", "/ R = ", "/ unit = ", "/ m"):
         assert part in b.stdout
     own = tmp_path / "own.csv"

@@ -19,6 +19,7 @@ from tsdf.grain.optics import Optics
 from tsdf.make import scatterometer
 from tsdf.make.scatterometer import Effort
 from tsdf.picture import image, render, world
+from tsdf.scene.deep import absorption_of_colour
 from tsdf.scene.medium import Component, volume_parameters
 from tsdf.scene.scene import (
     Absorption,
@@ -35,6 +36,7 @@ from tsdf.scene.scene import (
     SunLight,
     SurfaceSpec,
 )
+from tsdf.scene.sizes import convert
 
 dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba", reason='Mitsuba 3 is missing: pip install "tsdf-toolkit[mitsuba]"')
@@ -282,6 +284,46 @@ def test_mixture_and_file_in_xml(llvm, ball, crystal, tmp_path):
         <float name="grain_radius" value="1"/></medium></shape></scene>"""
         z = scores(mi.load_string(xml), arbiter, 64)
         assert (np.abs(z).max() < sidak(z.size) and abs(z.sum()) / math.sqrt(z.size) < 4.0) == (fraction == "3;1")
+
+
+def test_sizes_densities_and_colours_in_any_word(llvm, ball, crystal):
+    """What is said in others' words is the medium that `sizes` and `deep` say, in Python and by plugin parameters."""
+    facts = convert([(crystal, 1.0)], {"radius": 0.5, "packing_fraction": 0.4}).facts()
+    words = {"effective_radius": facts["effective_radius"], "solid_fraction": facts["solid_fraction"]}
+    colour = [0.9, 0.5, 0.2]
+    absorption = [x / 0.5 for x in absorption_of_colour(crystal, colour)]
+    mine = L.granular(crystal, 0.4, 0.5, absorption)
+    for word in ("albedo", "deep_colour"):
+        theirs = L.granular(crystal, **words, **{word: colour})
+        assert (theirs["packing_fraction"], theirs["grain_radius"]) == pytest.approx((0.4, 0.5))
+        found = [float(x) for x in theirs["absorption"].split()]
+        assert found == pytest.approx(absorption, rel=1e-6)
+    assert theirs["file"] == mine["file"]
+    stock = L.medium(crystal, deep_colour=colour, grain_radius=0.5, solid_fraction=facts["solid_fraction"])
+    assert stock["scale"] == pytest.approx(L.medium(crystal, 0.4, 0.5, absorption)["scale"])
+    plugin = mi.load_dict({"type": "granular", "file": mine["file"], "albedo": "0.9 0.5 0.2", **words})
+    assert plugin.bulk.radius == pytest.approx(0.5) and plugin.bulk.packing_fraction == pytest.approx(0.4)
+    assert plugin.bulk.sigma_a[0] == pytest.approx(absorption, rel=1e-6)
+    mixture = L.granular([L.Grain(crystal, 1.0, 0.0, colour), L.Grain(ball, 2.0, 0.3)], 0.4, 0.5)
+    assert [float(x) for x in mixture["absorption"].split(";")[0].split()] == pytest.approx(absorption, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"grain_radius": 1.0}, "how much of space is filled is missing"),
+        ({"packing_fraction": 0.5}, "how large grains are is missing: give grain_radius"),
+        ({"packing_fraction": 0.5, "grain_radius": 1.0, "sieve": 1.0}, "radius and sieve each say the size"),
+        ({"packing_fraction": 0.5, "effective_raduis": 1.0, "grain_radius": 1}, "did you mean 'effective_radius'?"),
+        ({"solid_fraction": 0.9, "grain_radius": 1.0}, "would take a packing fraction of 2"),
+        ({"packing_fraction": 0.5, "grain_radius": 1.0, "albedo": 1.0}, "without any absorption it is 1"),
+        ({"packing_fraction": 0.5, "grain_radius": 1.0, "albedo": 0.5, "absorption": 1.0}, "give one"),
+    ],
+)
+def test_words_that_cannot_be_meant(words, message, crystal):
+    with pytest.raises(UsageError) as caught:
+        L.medium(crystal, **words)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
 # ------------------------------------------------------------------------------------------- stock volpath

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
 from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
@@ -78,17 +78,17 @@ def heap(path: Path) -> Path:
 
 @lru_cache
 def table(name: str) -> Table:
-    return format.read(GOLDEN / f"{name}.tsdf.exr")
+    return tsdf_format.read(GOLDEN / f"{name}.tsdf.exr")
 
 
 def make_tables() -> None:
     """Write the tables of the pictures: kept, so that pictures tell of the renderer alone."""
     sphere = scatterometer.exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=48, joint=8, memory=8))
-    format.write(sphere, GOLDEN / "sphere.tsdf.exr")
+    tsdf_format.write(sphere, GOLDEN / "sphere.tsdf.exr")
     grain = load_grain("cube")
     build = Build.start(grain, Optics(1.31), Effort(paths=60_000, joint=4, memory=4))
     build.run(grain)
-    format.write(build.table(), GOLDEN / "cube.tsdf.exr")
+    tsdf_format.write(build.table(), GOLDEN / "cube.tsdf.exr")
 
 
 def scenes(folder: Path) -> dict[str, Scene]:

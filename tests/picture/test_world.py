@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.errors import SceneError
 from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
@@ -144,13 +144,13 @@ def test_how_far_the_target_is_does_not_matter(distance):
 
 def test_each_file_is_read_once(tmp_path, ball, monkeypatch):
     """A table named by 64 grains, through links and other spellings, is read once."""
-    format.write(ball, tmp_path / "ball.tsdf.exr")
+    tsdf_format.write(ball, tmp_path / "ball.tsdf.exr")
     (tmp_path / "link.exr").symlink_to("ball.tsdf.exr")
     names = ["ball.tsdf.exr", "link.exr", "../" + tmp_path.name + "/ball.tsdf.exr"]
     grains = tuple(GrainSpec(tmp_path / names[i % 3]) for i in range(64))
     reads = []
-    original = format.read
-    monkeypatch.setattr(format, "read", lambda path: reads.append(path) or original(path))
+    original = tsdf_format.read
+    monkeypatch.setattr(tsdf_format, "read", lambda path: reads.append(path) or original(path))
     scene = Scene(replace(CAMERA, position=(-9.0, 0.0, 0.0)), ONE, (MediumSpec(CUBE, 0.5, 0.1, grains),))
     made = world.build(scene, "teleport")
     assert len(reads) == 1

@@ -5,13 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table, thawed
 from tsdf.errors import UsageError
 from tsdf.reference_data.make_checks import CHECKS
 from tsdf.scene.medium import Component, free_path, volume_parameters
 
-SPHERE, CUBE = (format.read(CHECKS / f"{name}.tsdf.exr") for name in ("sphere", "cube"))
+SPHERE, CUBE = (tsdf_format.read(CHECKS / f"{name}.tsdf.exr") for name in ("sphere", "cube"))
 
 
 def altered(table: Table, **statistics: float) -> Table:
@@ -22,7 +22,7 @@ def altered(table: Table, **statistics: float) -> Table:
 
 
 EXACT_CUBE = altered(CUBE, hit_probability=2.0 / math.pi, mean_miss_chord=0.84895)  # physics: convex theorems
-IDENTITY = altered(format.read(CHECKS / "cube_identity.tsdf.exr"), mean_cosine=1.0, albedo=1.0)
+IDENTITY = altered(tsdf_format.read(CHECKS / "cube_identity.tsdf.exr"), mean_cosine=1.0, albedo=1.0)
 
 
 def draw_free_paths(path, rays: int, seed: int, gap: float) -> np.ndarray:

@@ -11,7 +11,8 @@ import pytest
 
 from tsdf.errors import SceneError, UsageError
 from tsdf.scene import scene
-from tsdf.scene.scene import Absorption, absorption_at, load, parse
+from tsdf.scene.scene import Absorption, load, parse
+from tsdf.scene.specs import absorption_at
 
 FILES = ("sky.exr", "heap.ply", "snow.tsdf.exr", "salt.tsdf.exr", "grain.stl")
 WHOLE = """
@@ -264,7 +265,7 @@ BROKEN = [  # (path, value, what the line says after the name of the scene)
     ("camera/exposure", math.inf, "[camera]: exposure must be a finite number"),
     ("camera/exposure", 2000, "[camera]: exposure must be >= -100 and <= 100, not 2000"),
     ("render/level", "telport", "[render]: level cannot be 'telport'; did you mean 'teleport'?"),
-    ("render/level", "x", "[render]: level cannot be 'x'; it is one of explicit, teleport-memory, teleport-joint,"),
+    ("render/level", "x", "[render]: level cannot be 'x'; it is one of explicit, teleport-packed,"),
     ("medium/0/inside", "outside", "inside cannot be 'outside'; it is one of grains, centres"),
     ("render/level", 3, "[render]: level must be text, not 3"),
     ("render/spp", 0, "[render]: spp must be from 1 to"),

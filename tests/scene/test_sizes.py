@@ -139,7 +139,7 @@ def test_too_dense_says_what_it_would_take(cube):
         ({"density": -1.0}, "density must be a finite number > 0, not -1"),
         ({"density": math.nan}, "density must be a finite number > 0, not nan"),
         ({"ssa": 20.0, "density": 100.0}, "ssa is per kg and in metres"),
-        ({"grainsize": 1.0, "density": 100.0}, "unknown size or amount 'grainsize'"),
+        ({"grainsize": 1.0, "density": 100.0}, "unknown size or amount 'grainsize'; there are radius"),
         ({"effective_radius": 1e31, "density": 100.0}, "out of range"),
     ],
 )

@@ -5,14 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table, thawed
 from tsdf.errors import SceneError
 from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.scene import deep
-from tsdf.scene.scene import absorption_at, files_of, parse
+from tsdf.scene.scene import parse
+from tsdf.scene.specs import absorption_at, files_of
 
 
 @pytest.fixture(scope="module")
@@ -22,8 +23,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     table = exact_sphere(load_grain("sphere"), Optics(1.31, material="ice"), Effort(cells=16))
     header = thawed(table.header)
     header["grain"]["volume"] /= 2.0
-    format.write(Table(header, table.pixels), place / "half.tsdf.exr")
-    format.write(table, place / "ball.tsdf.exr")
+    tsdf_format.write(Table(header, table.pixels), place / "half.tsdf.exr")
+    tsdf_format.write(table, place / "ball.tsdf.exr")
     (place / "own.csv").write_text("wavelength_nm,n,k\n300,1.5,1e-6\n900,1.5,1e-6\n")
     (place / "short.csv").write_text("wavelength_nm,n,k\n400,1.5,1e-6\n900,1.5,1e-6\n")
     (place / "clear.csv").write_text("wavelength_nm,n\n300,1.5\n900,1.5\n")
@@ -69,7 +70,7 @@ def test_a_colour_becomes_absorption(folder, word, inner):
     colour = [0.9, 0.5, 0.2]
     said = {"absorption": {word: colour}} if inner else {word: colour}
     spec = scene(folder, **said).grains[0].absorption
-    table = format.read(folder / "half.tsdf.exr")
+    table = tsdf_format.read(folder / "half.tsdf.exr")
     assert spec.kind == "rgb" and spec.colour == tuple(colour)
     assert [deep.deep_colour(table, a * 0.5) for a in spec.coefficient] == pytest.approx(colour, abs=1e-6)
     medium = {"effective_radius": 0.5, "density": 91.7}  # R is 1

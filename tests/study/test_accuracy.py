@@ -17,6 +17,7 @@ from tsdf.errors import SceneError, UsageError
 from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Effort, exact_sphere
+from tsdf.scene.levels import LEVELS
 from tsdf.scene.medium import Component, volume_parameters
 from tsdf.scene.scene import Absorption, GrainSpec
 from tsdf.study import accuracy, experiment, plots
@@ -189,6 +190,14 @@ def test_noise_of_a_profile_is_what_equal_profiles_differ_by(grain: GrainSpec) -
     assert rows[1].value > 4.0 * rows[1].error
 
 
+def test_runs_beside_each_other_add_up() -> None:
+    """Each keeps its mean, and what they took adds up field by field."""
+    runs = [Sums(10, np.array([m * 10.0]), np.array([(m**2 + 0.9) * 10.0]), 5, 3, 0.25) for m in (1.0, 2.0)]
+    both = accuracy._beside(runs)
+    assert both.mean == pytest.approx([1.0, 2.0]) and both.error == pytest.approx(np.sqrt([0.1, 0.1]))
+    assert (both.events, both.drawn, both.seconds) == (10, 6, 0.5)
+
+
 def test_lost_paths_are_counted_and_left_out() -> None:
     """A path that did not come to its last block has no number; the mean is that of the others."""
     nothing = experiment.Ends(*(np.zeros((0, 3)) for _ in range(3)), np.zeros(0), np.zeros((0, 0)), 0, 0, 0.0)
@@ -217,7 +226,8 @@ def test_every_number_has_a_row(small: accuracy.Accuracy) -> None:
     for row in small.rows:
         count[row.quantity] += 1
         assert math.isnan(row.deviation) == (row.level == "explicit" or row.quantity in ("profile", "time"))
-        assert math.isnan(row.paths_error) == (row.level != "explicit" or row.quantity in ("profile", "time"))
+        own = LEVELS[row.level].traits.packed and row.quantity not in ("profile", "time")
+        assert math.isnan(row.paths_error) != own
     assert count == {"displacement": 5, "reflectance": 20, "transmittance": 20, "profile": 16, "time": 5}
     lines = list(csv.DictReader(io.StringIO(accuracy.csv_text(small))))
     assert len(lines) == len(small.rows) and float(lines[0]["value"]) == small.rows[0].value

@@ -143,6 +143,11 @@ def test_every_level_has_a_row(ball: Scene) -> None:
     for row in found.rows:
         assert row.difference is not None
         assert row.variance_time == pytest.approx(row.picture.relative_error**2 * row.picture.seconds)
+    packed = found.rows[1]  # of packings of its own: no error is seen, for what they differ by is in its noise
+    assert packed.samples == found.rows[0].samples and packed.difference is not None
+    assert abs(packed.difference.square) < 4.0 * packed.difference.square_error
+    assert found.rows[-1].difference is not None
+    assert found.rows[-1].difference.square > 4.0 * found.rows[-1].difference.square_error
     lines = list(csv.DictReader(io.StringIO(compare.csv_text(found))))
     assert [line["level"] for line in lines] == list(LEVELS)
     assert float(lines[1]["mean"]) == found.rows[1].mean
@@ -179,6 +184,18 @@ def test_impossible_levels_are_said(ball: Scene) -> None:
     loose = compare.compare(without_joint(ball), ["teleport-joint"], spp=4, packings=2)
     assert [row.level for row in loose.rows] == ["explicit"]
     assert any(note.startswith("teleport-joint is skipped: ") for note in loose.notes)
+
+
+def test_explicit_grains_are_for_the_levels_that_take_them(ball: Scene) -> None:
+    """A chain is another one where a scene asks for them, a volume the same as without, and the report says so."""
+    asks = replace(ball, render=replace(ball.render, explicit_grains=1000))
+    one, other = (compare.compare(s, ["teleport", "volume"], spp=4, packings=2) for s in (asks, ball))
+    chains = [found.rows[1].picture.rgb for found in (one, other)]
+    assert [row.level for row in one.rows] == ["explicit", "teleport", "volume"]
+    assert not np.array_equal(*chains)
+    assert np.array_equal(one.rows[2].picture.rgb, other.rows[2].picture.rgb)
+    assert any("first 1000 grains" in note for note in one.notes)
+    assert not any("grains as" in note for note in other.notes)
 
 
 def test_a_furnace_has_no_error_and_no_noise(ball: Scene) -> None:

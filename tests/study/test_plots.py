@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table, thawed
 from tsdf.errors import TSDFError, UsageError
 from tsdf.reference_data.make_checks import CHECKS
@@ -16,7 +16,7 @@ from tsdf.study import plots
 
 @pytest.fixture(scope="module")
 def tables():
-    return {name: format.read(CHECKS / f"{name}.tsdf.exr") for name in ("sphere", "cube", "cube_identity")}
+    return {name: tsdf_format.read(CHECKS / f"{name}.tsdf.exr") for name in ("sphere", "cube", "cube_identity")}
 
 
 def axes_of(figure, title):
@@ -115,12 +115,12 @@ def test_no_global_state():
     """Importing plots imports no matplotlib; drawing keeps its settings."""
     script = (
         "import json, sys\n"
-        "from tsdf.data import format\n"
+        "from tsdf.data import format as tsdf_format\n"
         "from tsdf.study import plots\n"
         "late = 'matplotlib' not in sys.modules\n"
         "import matplotlib\n"
         "before = dict(matplotlib.rcParams)\n"
-        f"plots.plot_validation(format.read({str(CHECKS / 'cube.tsdf.exr')!r}))\n"
+        f"plots.plot_validation(tsdf_format.read({str(CHECKS / 'cube.tsdf.exr')!r}))\n"
         "print(json.dumps([late, before == dict(matplotlib.rcParams)]))"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)

@@ -12,7 +12,7 @@ import pytest
 
 from tsdf.cli.export import TARGETS
 from tsdf.cli.export import main as export
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
 from tsdf.errors import UsageError
 from tsdf.judge.validate import judge
@@ -35,7 +35,7 @@ def made(
     header, pixels = make_golden.table(weights or [1, 1, 2, 4, 6, 2], count=8, joint=True, memory=4, other=other)
     header, pixels = copy.deepcopy(header), pixels.copy()
     change(header, pixels)
-    table, findings = format.inspect(make_golden.file(header, pixels))
+    table, findings = tsdf_format.inspect(make_golden.file(header, pixels))
     assert table is not None, findings
     return table
 
@@ -106,7 +106,7 @@ def test_media_and_exports(name: str, tmp_path: Path, capsys: pytest.CaptureFixt
         volume = volume_parameters([Component(table)], 0.6, [absorption])
         assert 0.0 <= volume.albedo <= 1.0 and math.isfinite(volume.sigma_t) and volume.sigma_a >= 0.0
         assert -1.0 <= volume.g <= 1.0 if volume.albedo > 0.0 else math.isnan(volume.g)
-    format.write(table, tmp_path / "t.tsdf.exr")
+    tsdf_format.write(table, tmp_path / "t.tsdf.exr")
     for target in TARGETS:
         arguments = [str(tmp_path / "t.tsdf.exr"), "--to", target, "--packing", "0.6", "--radius", "1"]
         with pytest.raises(SystemExit) as done:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
 from tsdf.errors import SceneError
 from tsdf.grain.grains import load_grain
@@ -37,8 +37,7 @@ from tsdf.scene.scene import (
     SurfaceSpec,
 )
 from tsdf.spheres.packing import Packing, cells_of
-from tsdf.walk import explicit, hybrid, memory
-from tsdf.walk import transport as T
+from tsdf.walk import explicit, hybrid, memory, transport
 from tsdf.walk.walker import FLY, HANDED, MOST, UNKNOWN, WALKER
 
 CAMERA = Camera((0.0, -14.0, 6.0), (0.0, 0.0, 0.0), 12, 8)
@@ -168,7 +167,7 @@ def test_the_state_at_the_hand_over(ball: Table, radius: float) -> None:
         w = np.zeros(1, WALKER)[0]
         w["p"], w["d"], w["key"] = (radius * x, radius * y, 3.0 * radius), DOWN, key_of(3, i, 0)
         w["pdf"], w["free"], w["ray"], w["medium"], w["mode"], w["weight"] = -1.0, -1.0, -1, UNKNOWN, FLY, 1.0
-        state = T.follow(walkers.near, walkers.near_batches[0], w, np.zeros(0))
+        state = transport.follow(walkers.near, walkers.near_batches[0], w, np.zeros(0))
         assert state == HANDED and w["single"] == 1
         n = np.array([x, y, math.sqrt(1.0 - x * x - y * y)])
         d = np.array(DOWN) + 2.0 * n[2] * n
@@ -191,7 +190,7 @@ def test_the_next_sphere_is_that_of_the_packing(ball: Table) -> None:
     scene = Scene(
         ABOVE, (WHITE,), (MediumSpec(Sphere((0.0,) * 3, 500.0), 0.6, 1.0, (GrainSpec(ball),), packing_spheres=FEW),)
     )
-    made = world.build(replace(scene, render=Render(explicit_grains=2)), "teleport-memory")
+    made = world.build(replace(scene, render=Render(explicit_grains=2)), "teleport-memory", leap=0.0)
     walkers, arrays, room = Walkers(made), Handle(made.packed.arrays), Handle(made.place.room)
     walkers.asked[MOST] = 2  # room for more
     n, rng = 1_000, np.random.default_rng(1)
@@ -201,7 +200,7 @@ def test_the_next_sphere_is_that_of_the_packing(ball: Table) -> None:
         d = rng.normal(size=3)
         w["p"], w["d"], w["key"] = 30.0 * rng.random(3), d / np.linalg.norm(d), key_of(4, i, 0)
         w["pdf"], w["free"], w["ray"], w["medium"], w["mode"], w["weight"] = -1.0, -1.0, -1, UNKNOWN, FLY, 1.0
-        assert T.follow(walkers.near, walkers.near_batches[0], w, np.zeros(0)) == HANDED
+        assert transport.follow(walkers.near, walkers.near_batches[0], w, np.zeros(0)) == HANDED
         p, d, q = (np.array(w[name]) for name in "pdq")
         side = (p - q) - ((p - q) @ d) * d
 
@@ -266,7 +265,7 @@ def test_single_grains_show(ball: Table, sky: Path) -> None:
     halves, so that noise has no part in the mean."""
     spec = MediumSpec(Slab(-10.0, 0.0), 0.6, 1.0, (GrainSpec(ball),), inside="centres", packing_spheres=FEW)
     scene, still = Scene(ABOVE, (EnvironmentLight(sky),), (spec,)), (0.0, 0.0, 0.0)
-    grid = T.Camera((-3.0, -3.0, 20.0), (0.5, 0.0, 0.0), (0.0, 0.5, 0.0), DOWN, still, still, 12)
+    grid = transport.Camera((-3.0, -3.0, 20.0), (0.5, 0.0, 0.0), (0.0, 0.5, 0.0), DOWN, still, still, 12)
 
     def half(level: str, singles: int, seed: int) -> np.ndarray:
         made = world.build(asking(scene, singles, "centres"), level)
@@ -325,6 +324,13 @@ def test_what_is_said(heap: Scene, ball: Table) -> None:
     mirrors = replace(heap, media=(replace(heap.media[0], grains=(GrainSpec(build.table()),)),))
     (note,) = (n for n in world.build(asking(mirrors, 1), "teleport").notes if "mean cosine" in n)
     assert "take level explicit" in note
+    for shape, inside, thin in (
+        (Slab(0.0, 6.5), "grains", False), (Slab(0.0, 6.0), "grains", True), (Slab(0.0, 4.5), "centres", False),
+        (Slab(0.0, 4.0), "centres", True),
+    ):  # fmt: skip
+        layer = replace(heap, media=(replace(heap.media[0], shape=shape),), surfaces=())
+        said = [n for n in world.build(asking(layer, 1, inside), "teleport").notes if "a layer of 4 R" in n]
+        assert len(said) == thin
 
 
 def test_a_grain_of_a_file(tmp_path: Path, heap: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -339,7 +345,7 @@ def test_a_grain_of_a_file(tmp_path: Path, heap: Scene, monkeypatch: pytest.Monk
     grain = load_grain(tmp_path / "tables" / "rock.stl")
     build = scatterometer.Build.start(grain, Optics(1.31), Effort(2_000, memory=4))
     build.run(grain, 1)
-    format.write(build.table(), tmp_path / "tables" / "rock.tsdf.exr")
+    tsdf_format.write(build.table(), tmp_path / "tables" / "rock.tsdf.exr")
     spec = GrainSpec(tmp_path / "tables" / "rock.tsdf.exr")
     scene = replace(heap, media=(replace(heap.media[0], grains=(spec,)),), folder=str(tmp_path / "scenes"))
     monkeypatch.chdir(tmp_path / "here")

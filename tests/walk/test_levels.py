@@ -37,8 +37,8 @@ from tsdf.scene.scene import (
     Sphere,
     SunLight,
     SurfaceSpec,
-    absorption_at,
 )
+from tsdf.scene.specs import absorption_at
 from tsdf.spheres.packing import pack
 from tsdf.walk import explicit
 from tsdf.walk.geometry import place

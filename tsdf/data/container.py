@@ -1,4 +1,4 @@
-"""The container that tables are kept in: an OpenEXR image with a header in JSON, as ``schema/SPEC.md`` lays down.
+"""Container of tables: an OpenEXR image with a header in JSON, as ``schema/SPEC.md`` lays down.
 
 What sections 2, 6, 7, 8 of it and the first half of 3 ask of every file stands here, whatever the file holds: what
 differs from one format to the next is a `Format`. The formats themselves are `format` (grains) and `packing_table`

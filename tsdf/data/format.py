@@ -1,4 +1,4 @@
-"""The bytes of a table: reads and writes ``name.tsdf.exr``, as ``schema/SPEC.md`` lays down.
+"""Format of a table: reads and writes its bytes, ``name.tsdf.exr``, as ``schema/SPEC.md`` lays down.
 
 What its header, its blocks and its pixels must be; the file around them, an OpenEXR image, is `container`. What a
 table is stands in `table`; whether its numbers are plausible physics, in `validate`.

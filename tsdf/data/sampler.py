@@ -1,4 +1,4 @@
-"""Drawing from a table: Algorithm 1 of Meng et al. 2015, as numba kernels for a renderer and as arrays for a user.
+"""Sampler of a table: Algorithm 1 of Meng et al. 2015, as numba kernels for a renderer and as arrays for a user.
 
 Every cell is found by exact inversion of cumulative masses, so a draw is a monotone function of its random number; a
 guide tells where to begin to look (the cutpoint method, Chen & Asau 1974), so it takes about one step. A cell

@@ -1,4 +1,4 @@
-"""What a table is: the response of one grain, as the rows and columns of ``schema/SPEC.md``.
+"""Table: the response of one grain, as the rows and columns of ``schema/SPEC.md``.
 
 A `Table` is the pixels of the file and its header, both read-only, and nothing else: what can be derived from them
 is derived here. How a table is made is `scatterometer`, its bytes are `format`. Lengths are in units of the bounding

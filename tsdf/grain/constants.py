@@ -138,21 +138,14 @@ def _csv(text: str) -> tuple[Span, Span | None, str]:
             return []
 
     header = [name.lower() for name in fields(lines[0][1])] or [""]
-    found = re.fullmatch(r"(?:wavelength|lambda|wl)?[ _]*[(\[]?(nm|um|µm|μm|m)[)\]]?", header[0])
-    if found is None:
-        raise ValueError(f"line {lines[0][0]}: {_line(header[0], 40)!r} does not name wavelength and its unit")
-    columns = {name: header.index(name) for name in ("n", "k") if name in header}
-    if "n" not in columns:
-        raise ValueError(f"line {lines[0][0]}: there is no column n")
-    if twice := [name for name in columns if header.count(name) > 1]:
-        raise ValueError(f"line {lines[0][0]}: there are two columns {twice[0]}")
+    unit, columns = _header(header, lines[0][0])
     rows: dict[str, Rows] = {name: [] for name in columns}
     for i, line in lines[1:]:
         numbers = [field.replace(",", ".") if separator != "," else field for field in fields(line)]
         try:
             if not numbers or any(numbers[len(header) :]):  # decimal commas between commas, say
                 raise ValueError
-            wavelength = float(numbers[0]) * NM[found[1]]
+            wavelength = float(numbers[0]) * unit
             for name, column in columns.items():
                 if column < len(numbers) and numbers[column]:  # k may be given for some wavelengths only
                     rows[name].append((wavelength, float(numbers[column])))
@@ -162,6 +155,19 @@ def _csv(text: str) -> tuple[Span, Span | None, str]:
         raise ValueError("there are no lines of numbers")
     k = _table(rows["k"], "k") if rows.get("k") else None
     return _table(rows["n"], "n"), k, _line(comments[0]) if comments else ""
+
+
+def _header(names: list[str], line: int) -> tuple[float, dict[str, int]]:
+    """Return the unit of wavelength [nm] that a header names first, and which columns n and k are."""
+    found = re.fullmatch(r"(?:wavelength|lambda|wl)?[ _]*[(\[]?(nm|um|µm|μm|m)[)\]]?", names[0])
+    if found is None:
+        raise ValueError(f"line {line}: {_line(names[0], 40)!r} does not name wavelength and its unit")
+    columns: dict[str, int] = {name: names.index(name) for name in ("n", "k") if name in names}
+    if "n" not in columns:
+        raise ValueError(f"line {line}: there is no column n")
+    if twice := [name for name in columns if names.count(name) > 1]:
+        raise ValueError(f"line {line}: there are two columns {twice[0]}")
+    return NM[found[1]], columns
 
 
 # ------------------------------------------------------------------------------------------ refractiveindex.info

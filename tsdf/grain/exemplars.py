@@ -105,11 +105,18 @@ def hexprism(aspect: float) -> Mesh:
 # ------------------------------------------------------------------------------------ star-shaped grains
 
 
+ICOSAHEDRON = (
+    (0, 8, 4), (5, 0, 2), (2, 0, 4), (7, 3, 1), (8, 1, 6), (4, 8, 6), (1, 3, 6), (10, 1, 8), (10, 0, 5), (8, 0, 10),
+    (10, 7, 1), (5, 7, 10), (11, 7, 5), (5, 2, 11), (3, 7, 11), (4, 6, 9), (9, 2, 4), (9, 6, 3), (9, 11, 2), (3, 11, 9),
+)  # fmt: skip
+
+
 def icosphere(subdivisions: int) -> Mesh:
     """Return a unit sphere of 20 * 4^`subdivisions` faces: an icosahedron, edges halved and pushed out."""
     golden = (1 + 5**0.5) / 2
     ring = np.array([[0.0, s, t * golden] for s, t in product((-1, 1), repeat=2)])
-    vertices, faces = _hull(np.vstack([np.roll(ring, k, axis=1) for k in range(3)]) / np.hypot(1, golden))
+    vertices = np.vstack([np.roll(ring, k, axis=1) for k in range(3)]) / np.hypot(1, golden)
+    faces = np.array(ICOSAHEDRON)
     for _ in range(subdivisions):
         n = len(vertices)
         ends = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)

@@ -1,30 +1,29 @@
-"""How large a grain is across: its maximum dimension, and the sieve that it passes.
+"""Extent of a grain: its maximum dimension, and the sieve that it passes.
 
 Both are of the convex hull and in the unit of the vertices. Volume, surface and projected area are elsewhere: `grains`
 has the first two, a table's hit_probability is the third over that of the bounding sphere.
 """
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
-from scipy.spatial import ConvexHull
-from scipy.spatial.transform import Rotation
 
 Floats = NDArray[np.float64]
 
 DIRECTIONS, TURNS = 300, 24  # from which the search for a sieve starts
 STARTS = 8  # of these, from which it goes on
+STEPS = 600  # of a search at most; about 100 are enough
 BLOCK = 1024  # vertices whose distances to all are held at once
 ALIKE = 512  # directions whose extreme vertices stand for all where a search starts
 
 
 def maximum_dimension(vertices: Floats) -> float:
     """Return the greatest distance between two points of a body, given its vertices (n, 3)."""
-    points = vertices[ConvexHull(vertices).vertices]
-    reach = np.linalg.norm(points, axis=1)
-    points = points[reach >= _widest(_extremes(points)) - reach.max() * (1.0 + 1e-9)]  # others have no one so far
+    reach = np.linalg.norm(vertices, axis=1)
+    points = vertices[reach >= _widest(_extremes(vertices)) - reach.max() * (1.0 + 1e-9)]  # others have no one so far
     return _widest(points)
 
 
@@ -48,8 +47,7 @@ def sieve(vertices: Floats) -> float:
     vertices : (n, 3) float64
         Of the body.
     """
-    points = vertices[ConvexHull(vertices).vertices]
-    few = _extremes(points)
+    few = _extremes(vertices)
     angles = np.arange(TURNS) * (0.5 * math.pi / TURNS)
     first = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(TURNS)])
     second = np.column_stack([-np.sin(angles), np.cos(angles), np.zeros(TURNS)])
@@ -58,28 +56,86 @@ def sieve(vertices: Floats) -> float:
         """Return the hole that points, turned so that they move along z, need at each angle, (TURNS,)."""
         return np.maximum(np.ptp(turned @ first.T, axis=0), np.ptp(turned @ second.T, axis=0))
 
-    ways = [Rotation.align_vectors([[0.0, 0.0, 1.0]], [d])[0] for d in _hemisphere(DIRECTIONS)]
-    found = np.array([needed(way.apply(few)) for way in ways])
+    def hole(turn: Floats, start: Floats, across: Floats) -> float:
+        """Return the hole that points, (3, k), need which move across two directions (3, 2) that are turned."""
+        along = (_rotation(turn) @ start).T @ across
+        return float((along.max(axis=1) - along.min(axis=1)).max())
+
+    ways = [_frame(d) for d in _hemisphere(DIRECTIONS)]
+    found = np.array([needed(few @ way) for way in ways])
     best = np.argsort(found.min(axis=1))[:STARTS]
     least = math.inf
     for k in best:
-        start = Rotation.from_euler("z", -float(angles[found[k].argmin()])) * ways[k]
-
-        def hole(turn: Floats, start: Rotation = start) -> float:
-            return float(np.ptp((Rotation.from_rotvec(turn) * start).apply(points)[:, :2], axis=0).max())
-
-        simplex = np.vstack([np.zeros(3), 0.05 * np.eye(3)])
-        done = minimize(
-            hole, np.zeros(3), method="Nelder-Mead", options={"initial_simplex": simplex, "xatol": 1e-7, "fatol": 1e-9}
-        )
-        least = min(least, float(done.fun))
+        at = found[k].argmin()
+        start = ways[k] @ np.column_stack([first[at], second[at]])
+        turn, size, missed = np.zeros(3), 0.05, True
+        while missed:
+            across = np.ascontiguousarray(few.T)
+            turn, narrowest = _lowest(partial(hole, start=start, across=across), turn, size)
+            size = 0.005
+            along = vertices @ (_rotation(turn) @ start)
+            width = float(np.ptp(along, axis=0).max())
+            missed = width > narrowest * (1.0 + 1e-9)
+            if missed:  # vertices that were not among the few
+                few = np.unique(
+                    np.vstack([few, vertices[along.argmax(axis=0)], vertices[along.argmin(axis=0)]]), axis=0
+                )
+        least = min(least, width)
     return least
+
+
+def _lowest(function: Callable[[Floats], float], start: Floats, size: float) -> tuple[Floats, float]:
+    """Return where a function of three numbers is lowest near a start, and its value there: the simplex search of
+    Nelder & Mead (1965), from a simplex of that size."""
+    corners = start + size * np.vstack([np.zeros(3), np.eye(3)])
+    values = np.array([function(corner) for corner in corners])
+    for _ in range(STEPS):
+        order = values.argsort(kind="stable")
+        corners, values = corners[order], values[order]
+        if values[-1] - values[0] <= 1e-9 and np.abs(corners[1:] - corners[0]).max() <= 1e-7:
+            break
+        middle = corners[:-1].mean(axis=0)
+        way = middle - corners[-1]
+        new = middle + way
+        value = function(new)
+        if value < values[0]:
+            if (farther := function(new + way)) < value:
+                new, value = new + way, farther
+        elif value >= values[-2]:
+            nearer = middle + (0.5 if value < values[-1] else -0.5) * way
+            if (there := function(nearer)) >= min(value, values[-1]):
+                corners[1:] = 0.5 * (corners[0] + corners[1:])
+                values[1:] = [function(corner) for corner in corners[1:]]
+                continue
+            new, value = nearer, there
+        corners[-1], values[-1] = new, value
+    return corners[0], float(values[0])
+
+
+def _frame(d: Floats) -> Floats:
+    """Return a rotation (3, 3) whose last column is a unit direction."""
+    u = np.cross(d, np.eye(3)[np.abs(d).argmin()])
+    u /= np.linalg.norm(u)
+    return np.column_stack([u, np.cross(d, u), d])
+
+
+def _rotation(turn: Floats) -> Floats:
+    """Return the rotation (3, 3) by a vector: about it, by its length [rad] (Rodrigues)."""
+    angle = math.sqrt(turn @ turn)
+    x, y, z = turn
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    if angle < 1e-12:
+        return np.eye(3) + cross
+    c, s = (1.0 - math.cos(angle)) / angle**2, math.sin(angle) / angle
+    rotation: Floats = np.eye(3) + s * cross + c * (cross @ cross)
+    return rotation
 
 
 def _extremes(points: Floats) -> Floats:
     """Return the points that are farthest in some direction, of many directions."""
     along = _hemisphere(ALIKE) @ points.T
-    return points[np.unique([along.argmax(axis=1), along.argmin(axis=1)])]
+    chosen: Floats = points[np.unique([along.argmax(axis=1), along.argmin(axis=1)])]
+    return chosen
 
 
 def _hemisphere(count: int) -> Floats:

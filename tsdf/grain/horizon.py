@@ -1,4 +1,4 @@
-"""What stands before a facet: from how low an elevation on light comes and goes unobstructed."""
+"""Horizon map: what stands before a facet, from how low an elevation on light comes and goes unobstructed."""
 
 import math
 from typing import NamedTuple
@@ -163,9 +163,19 @@ def _hulls(points, nodes):
     return filled, reach
 
 
+class Groups(NamedTuple):
+    """Points (n, 3) in groups and, of the tree of these, how far each reaches along the nodes (2 groups, nodes);
+    sides (2, 3): the nodes against and along each axis."""
+
+    points: np.ndarray
+    reach: np.ndarray
+    sides: np.ndarray
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _stand_before(planes, nodes, weights, centroids, slopes, tolerance, points, reach, sides, before):
+def _stand_before(planes, nodes, weights, centroids, slopes, tolerance, groups, before):
     """Write into `before` which facets have a point further before them than the tolerance and slope allow."""
+    points, reach, sides = groups.points, groups.reach, groups.sides
     leaves = len(reach) // 2
     waiting = np.empty(128, np.int64)
     for i in range(len(planes)):
@@ -225,12 +235,11 @@ def stand_before(
     sides = np.array(
         [[index[0, f, f], index[f, 0, f], index[f, f, 0]], [index[-1, f, f], index[f, -1, f], index[f, f, -1]]]
     )
+    groups = Handle(Groups(points, reach, sides))
     for begin in range(0, len(planes), CHUNK):
         part = slice(begin, begin + CHUNK)
         which, weights = _weights(planes[part, :3], index)
-        _stand_before(
-            planes[part], which, weights, centroids[part], slopes[part], tolerance, points, reach, sides, before[part]
-        )
+        _stand_before(planes[part], which, weights, centroids[part], slopes[part], tolerance, groups, before[part])
     return before
 
 

@@ -1,4 +1,4 @@
-"""What grains are made of: refractive index n and absorption index k of six materials, by wavelength.
+"""Materials of grains: refractive index n and absorption index k of six of them, by wavelength.
 
 The complex index is n - i k, so the absorption coefficient of the bulk is 4 pi k / wavelength. How light
 meets a surface is `optics`. The numbers are those of the refractiveindex.info database (CC0), which has them

@@ -205,21 +205,8 @@ def _read_ply(data: bytes) -> list[Part]:
     end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r|$)", data)
     if not data.startswith(b"ply") or end is None:
         raise ValueError("no PLY header")
-    header, body = data[: end.start()], data[end.end() :]
-    order: str | None = None
-    elements: list[tuple[str, int, list[Column]]] = []
-    for line in header.decode("ascii", errors="replace").splitlines():
-        match line.split():
-            case ["format", "ascii" | "binary_little_endian" | "binary_big_endian" as name, *_]:
-                order = {"a": "", "l": "<", "b": ">"}[name.removeprefix("binary_")[0]]
-            case ["element", name, count]:
-                elements.append((name, int(count), []))
-            case ["property", "list", length, kind, name]:
-                elements[-1][2].append(Column(name, PLY_TYPES[kind], PLY_TYPES[length]))
-            case ["property", kind, name]:
-                elements[-1][2].append(Column(name, PLY_TYPES[kind]))
-    if order is None:
-        raise ValueError("no format in its header")
+    body = data[end.end() :]
+    order, elements = _ply_header(data[: end.start()])
     text = None if order else numbers(body)
     places, at = np.empty((0, 3)), 0
     faces: list[tuple[bool, Ints, Ints]] = []
@@ -244,6 +231,25 @@ def _read_ply(data: bytes) -> list[Part]:
         _strips(places, corners, sizes) if strips else Part(places, corners, sizes) for strips, corners, sizes in faces
     ]
     return parts or [Part(places, np.empty(0, np.int64), np.empty(0, np.int64))]
+
+
+def _ply_header(header: bytes) -> tuple[str, list[tuple[str, int, list[Column]]]]:
+    """Return the order of bytes, "" for text, and the elements of a PLY: name, rows, columns."""
+    order: str | None = None
+    elements: list[tuple[str, int, list[Column]]] = []
+    for line in header.decode("ascii", errors="replace").splitlines():
+        match line.split():
+            case ["format", "ascii" | "binary_little_endian" | "binary_big_endian" as name, *_]:
+                order = {"a": "", "l": "<", "b": ">"}[name.removeprefix("binary_")[0]]
+            case ["element", name, count]:
+                elements.append((name, int(count), []))
+            case ["property", "list", length, kind, name]:
+                elements[-1][2].append(Column(name, PLY_TYPES[kind], PLY_TYPES[length]))
+            case ["property", kind, name]:
+                elements[-1][2].append(Column(name, PLY_TYPES[kind]))
+    if order is None:
+        raise ValueError("no format in its header")
+    return order, elements
 
 
 def _strips(places: Floats, corners: Ints, sizes: Ints) -> Part:

@@ -1,4 +1,4 @@
-"""Light meets a surface: the optical constants that a table is made for, Fresnel reflectance, and a hit on a facet.
+"""Optics: light meets a surface; the constants that a table is made for, Fresnel reflectance, a hit on a facet.
 
 Directions are those of propagation. `Optics.eta` is that of the grain, n_inside / n_outside; `fresnel` and `parted`
 take that of the hit at hand, n_transmitted / n_incident. A ray engine says which facet light meets; where, is computed

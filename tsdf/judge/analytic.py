@@ -1,4 +1,4 @@
-"""What the answer should be: geometrical optics of the dielectric sphere, and theorems for any grain.
+"""Analytic answers: geometrical optics of the dielectric sphere, and theorems for any grain.
 
 Nothing here traces a ray or reads a table, and nothing of the package is imported but its errors: this
 module judges the rest. Lengths are in units of the sphere's radius, angles in radians, `eta` is

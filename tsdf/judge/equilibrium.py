@@ -1,4 +1,4 @@
-"""What equilibrium says of light's way inside a lossless grain, exactly, for grains whose facets keep its angles.
+"""Equilibrium: light's way inside a lossless grain, exactly, for grains whose facets keep its angles.
 
 In isotropic light the radiance inside is eta^2 times that outside, in every direction that outside light can reach, so
 the mean path inside obeys <l> beta pi R^2 = eta^2 V reach. In a sphere each chord keeps its angle with the surface; in

@@ -1,4 +1,4 @@
-"""Is a table right? Its structure, its statistics against its pixels, and both against physics.
+"""Validation: is a table right? Its structure, its statistics against its pixels, and both against physics.
 
 `validate` runs three parts: the structure (`format.check`), what the header says about the pixels and about
 itself (codes ``STATISTICS_``), and what is known of the grain without tracing it (``PHYSICS_``): the exact sphere,
@@ -11,7 +11,7 @@ import os
 import warnings
 from dataclasses import dataclass
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
 from tsdf.errors import Finding, FormatWarning
 from tsdf.judge.consistency import judge_memory, judge_records, judge_statistics
@@ -60,12 +60,12 @@ def validate(path: str | os.PathLike[str], structure_only: bool = False) -> Repo
     (True, ())
     """
     name = os.fspath(path)
-    findings = tuple(format.check(path))
+    findings = tuple(tsdf_format.check(path))
     if any(finding.severity == "error" for finding in findings):
         return Report(name, findings, ("structure",), 0, None)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FormatWarning)  # it is among the findings
-        table = format.read(path)
+        table = tsdf_format.read(path)
     if structure_only:
         return Report(name, findings, ("structure",), 0, table)
     more, checks = judge(table)

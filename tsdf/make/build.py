@@ -6,7 +6,8 @@ from pathlib import Path
 from tsdf.data.table import Table
 from tsdf.grain.grains import Grain, load_grain
 from tsdf.grain.optics import Optics
-from tsdf.make.scatterometer import Build, Effort, exact_sphere
+from tsdf.make.effort import Effort
+from tsdf.make.scatterometer import Build, exact_sphere
 
 
 def build(

@@ -1,4 +1,4 @@
-"""Threads that trace paths in rounds: while what one round counted is summed, they are at the next.
+"""Crew: threads that trace paths in rounds; while what one round counted is summed, they are at the next.
 
 Each thread has a tracer of its own and a tally for each of two rounds, so nobody waits for anybody. How the paths are
 shared out does not show in the sums.

@@ -1,4 +1,4 @@
-"""The table of the exact sphere, by quadrature over the impact parameter.
+"""Exact sphere: its table, by quadrature over the impact parameter.
 
 `analytic` lists what leaves the sphere as intervals of cos theta; here they are spread over the cells of a table. No
 random numbers, and no error but the width of the cells.

@@ -1,4 +1,4 @@
-"""How a table is made: a grain, its optics and an effort in, a `Table` out.
+"""Scatterometer: how a table is made; a grain, its optics and an effort in, a `Table` out.
 
 Paths are numbered, and all counts are integers that add up in any order, so the same request gives the same bytes for
 any number of threads, interrupted and resumed or not, in one piece or in parts merged afterwards. What counts is only
@@ -270,9 +270,7 @@ class Build:
         target = self.effort.target_error
         if target is None:
             progress.total = size(self._wanted(part))
-        whole = without(self._wanted(part), self.done) == []
-        late = bool(self.done) and deadline <= time.monotonic()
-        if late or (whole and (target is None or self._judge_and_save(progress, part_file))):
+        if self._complete(part, part_file, progress, deadline):
             progress.error = self.error() if tell and not progress.error else progress.error
             if part_file is not None:
                 self.save(part_file)
@@ -286,11 +284,8 @@ class Build:
         with crew:
             while True:
                 while len(under_way) < 2 and not leave.is_set():
-                    wanted = self._wanted(part)
-                    if target is not None and wanted == ahead:  # go on while the target is judged
-                        wanted = [(0, next(last for _, last in chunks(None) if last > self.judgement))]
                     running = sum(size(one.pieces.values()) for one in under_way)
-                    spans = beginning(without(wanted, ahead), pace.next(running))
+                    spans = beginning(self._left(part, ahead), pace.next(running))
                     if not spans:
                         break
                     under_way.append(crew.start(spans))
@@ -321,6 +316,20 @@ class Build:
                     saved = time.monotonic()
         if part_file is not None and (self.done or not leave.is_set()):
             self.save(part_file)
+
+    def _complete(self, part: tuple[int, int], part_file: Path | None, progress: Progress, deadline: float) -> bool:
+        """Return whether nothing is to be traced: all is done, and meets the target, or it is too late for more."""
+        if self.done and deadline <= time.monotonic():
+            return True
+        whole = without(self._wanted(part), self.done) == []
+        return whole and (self.effort.target_error is None or self._judge_and_save(progress, part_file))
+
+    def _left(self, part: tuple[int, int], ahead: Spans) -> Spans:
+        """Return which paths are wanted beside those `ahead`; more than the target needs while it is judged."""
+        wanted = self._wanted(part)
+        if self.effort.target_error is not None and wanted == ahead:
+            wanted = [(0, next(last for _, last in chunks(None) if last > self.judgement))]
+        return without(wanted, ahead)
 
     def _judge_and_save(self, progress: Progress, part_file: Path | None) -> bool:
         """Tell whether the target is met; what is done is safe even if it is out of reach."""
@@ -430,20 +439,7 @@ class Build:
             if (request["part_version"], request["software"]) != (PART_VERSION, files.software()):
                 made = printable(str(request["software"]))[:100]
                 raise TSDFError(f"{path}: made by another version ({made}): build it again")
-            kept, done = arrays.pop("records_kept"), arrays.pop("done")
-            if (
-                kept.shape != (2,)
-                or done.ndim != 2
-                or done.shape[1] != 2
-                or {kept.dtype, done.dtype} != {np.dtype(np.int64)}
-            ):
-                raise ValueError("done")
-            joint, memory = (int(k) for k in kept)
-            if not (0 <= joint <= MAX_JOINT and 0 <= memory <= MAX_JOINT):
-                raise ValueError("records_kept")
-            spans = [(int(first), int(last)) for first, last in done]
-            if joined(spans) != spans or any(not 0 <= first < last <= MAX_PATHS for first, last in spans):
-                raise ValueError("done")
+            joint, memory, spans = _kept_and_done(arrays.pop("records_kept"), arrays.pop("done"))
             effort, judgement = request["effort"], request["judgement"]
             whole = [judgement, *(value for key, value in effort.items() if key != "target_error")]
             if any(type(value) is not int for value in whole if value is not None) or not 0 <= judgement <= MAX_PATHS:
@@ -481,6 +477,20 @@ class Build:
             ((last - numbers + T.REPLICATES - 1) // T.REPLICATES - (first - numbers + T.REPLICATES - 1) // T.REPLICATES
              for first, last in self.done), np.zeros(T.REPLICATES, np.int64)
         )  # fmt: skip
+
+
+def _kept_and_done(kept: np.ndarray, done: np.ndarray) -> tuple[int, int, Spans]:
+    """Return how many records of either kind a part file keeps, and which paths are done; ValueError if that cannot
+    be."""
+    if kept.shape != (2,) or done.ndim != 2 or done.shape[1] != 2 or {kept.dtype, done.dtype} != {np.dtype(np.int64)}:
+        raise ValueError("done")
+    joint, memory = (int(k) for k in kept)
+    if not (0 <= joint <= MAX_JOINT and 0 <= memory <= MAX_JOINT):
+        raise ValueError("records_kept")
+    spans = [(int(first), int(last)) for first, last in done]
+    if joined(spans) != spans or any(not 0 <= first < last <= MAX_PATHS for first, last in spans):
+        raise ValueError("done")
+    return joint, memory, spans
 
 
 def merge(paths: list[Path]) -> Build:

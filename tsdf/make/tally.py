@@ -1,4 +1,4 @@
-"""What the scatterometer counts: integer sums that add up in any order to the same total.
+"""Tally: what the scatterometer counts; integer sums that add up in any order to the same total.
 
 A `Tally` is a set of int64 arrays plus, if asked for, reservoirs of records by deflection and by entry. Weights are
 fixed-point: a path starts with `UNIT` units of energy and every split of them is exact, so that the energy ledger

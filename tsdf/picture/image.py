@@ -145,38 +145,12 @@ def _read(path: str | os.PathLike[str], most: float) -> tuple[Image, Mapping[str
     import OpenEXR
 
     name = os.fspath(path)
-    try:
-        if not stat.S_ISREG(os.stat(path).st_mode):
-            raise TSDFError(f"{name} is not a regular file; name an .exr image")
-        with open(path, "rb") as file:
-            magic = file.read(12)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise TSDFError(f"cannot read {name}: {reason}; check the name and the permissions") from error
-    if not magic.startswith(MAGIC):
-        kind = next((kind for start, kind in OTHERS.items() if magic.startswith(start)), "")
-        way_out = (
-            f"but {kind}; save it as OpenEXR, with a converter or an image editor" if kind else "name an .exr image"
-        )
-        raise TSDFError(f"{name} is not an OpenEXR file (bytes 0), {way_out}")
+    _check_kind(path)
     damaged = f"{name}: the file is damaged or truncated, fetch or make it again"
     try:
         with _hushed():
             headers = [part.header for part in OpenEXR.File(os.fsdecode(path), header_only=True).parts]
-        numbers = 0
-        for header in headers:  # before the pixels, for OpenEXR allocates whatever a damaged header asks for
-            for window in WINDOWS:
-                height, width = _size(header[window])
-                numbers += height * width * (len(header["channels"]) if window == "dataWindow" else 0)
-                if not _readable(height, width):
-                    raise TSDFError(
-                        f"{name}: {width} x {height} pixels ({window}) are not an image this reads; shrink it"
-                    )
-                if numbers > most:
-                    raise TSDFError(
-                        f"{name}: {width} x {height} pixels ({window}) are {numbers:.2g} numbers in all channels, and "
-                        f"{most:.2g} are read out of a file of its size; shrink it, or leave out other channels"
-                    )
+        _check_sizes(name, headers, most)  # before the pixels: OpenEXR allocates whatever a damaged header asks for
         if headers and all("deep" in str(header["type"]) for header in headers):
             raise TSDFError(f"{name}: its pixels are deep (several samples each), not an image; flatten it")
         with _hushed():
@@ -199,6 +173,41 @@ def _read(path: str | os.PathLike[str], most: float) -> tuple[Image, Mapping[str
                 texts = {key: value for key, value in header.items() if isinstance(value, str)}
                 return Image(np.stack(rgb, axis=-1), np.stack(variance, axis=-1) if variance else None, texts), header
     raise TSDFError(f"{name}: {_why_no_colour(flat)}; save it as an image with channels R, G, B")
+
+
+def _check_kind(path: str | os.PathLike[str]) -> None:
+    """Refuse what is no OpenEXR file by its first bytes, or cannot be read."""
+    name = os.fspath(path)
+    try:
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            raise TSDFError(f"{name} is not a regular file; name an .exr image")
+        with open(path, "rb") as file:
+            magic = file.read(12)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise TSDFError(f"cannot read {name}: {reason}; check the name and the permissions") from error
+    if not magic.startswith(MAGIC):
+        kind = next((kind for start, kind in OTHERS.items() if magic.startswith(start)), "")
+        way_out = (
+            f"but {kind}; save it as OpenEXR, with a converter or an image editor" if kind else "name an .exr image"
+        )
+        raise TSDFError(f"{name} is not an OpenEXR file (bytes 0), {way_out}")
+
+
+def _check_sizes(name: str, headers: Sequence[Mapping[str, Any]], most: float) -> None:
+    """Refuse parts that are too large, each or together."""
+    numbers = 0
+    for header in headers:
+        for window in WINDOWS:
+            height, width = _size(header[window])
+            numbers += height * width * (len(header["channels"]) if window == "dataWindow" else 0)
+            if not _readable(height, width):
+                raise TSDFError(f"{name}: {width} x {height} pixels ({window}) are not an image this reads; shrink it")
+            if numbers > most:
+                raise TSDFError(
+                    f"{name}: {width} x {height} pixels ({window}) are {numbers:.2g} numbers in all channels, and "
+                    f"{most:.2g} are read out of a file of its size; shrink it, or leave out other channels"
+                )
 
 
 @contextlib.contextmanager

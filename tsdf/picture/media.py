@@ -16,7 +16,8 @@ from tsdf.picture import image
 from tsdf.scene.levels import Traits
 from tsdf.scene.medium import Component, VolumeParameters, free_path, volume_parameters
 from tsdf.scene.scene import Absorption as AbsorptionSpec
-from tsdf.scene.scene import MediumSpec, Scene, absorption_at
+from tsdf.scene.scene import MediumSpec, Scene
+from tsdf.scene.specs import absorption_at
 from tsdf.walk.lights import LUMINANCE
 from tsdf.walk.walker import Absorption, Media
 
@@ -80,10 +81,10 @@ class Amounts:
     def arrays(self) -> Absorption:
         """Return all of them for kernels."""
         count, wavelengths = len(self._columns), len(self.weight)
-        spectral = np.array([column for column, _ in self._columns]).T.reshape(wavelengths, count)
+        spectral = np.array([column for column, _ in self._columns]).reshape(count, wavelengths)
         rgb = np.array([column for _, column in self._columns]).T.reshape(3, count)
-        least = rgb.max(axis=0) + (spectral.max(axis=0) if wavelengths else 0.0)
-        return Absorption(*map(np.ascontiguousarray, (spectral, rgb, self.weight, least)))
+        least = rgb.max(axis=0) + (spectral.max(axis=1) if wavelengths else 0.0)
+        return Absorption(*map(np.ascontiguousarray, (spectral, rgb, self.weight.T, least)))
 
 
 class _Row(NamedTuple):

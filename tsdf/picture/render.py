@@ -23,8 +23,7 @@ from tsdf.handle import Handle
 from tsdf.picture.trust import Moments, Trust, kurtosis_of
 from tsdf.picture.world import World, camera_of, sees
 from tsdf.scene.levels import LEVELS
-from tsdf.walk import packed
-from tsdf.walk import transport as T
+from tsdf.walk import packed, transport
 from tsdf.walk import walker as W
 from tsdf.walk.hybrid import ALL
 from tsdf.walk.transport import Camera
@@ -101,7 +100,7 @@ class Walkers:
     """
 
     def __init__(self, world: World) -> None:
-        near = T.WorldArrays(
+        near = transport.WorldArrays(
             world.place.arrays, world.place.room, world.media, world.tables, world.lights, world.packed.arrays,
             world.memory, world.leaps, world.absorption,
         )  # fmt: skip
@@ -123,6 +122,7 @@ class Walkers:
         self.grain_starts, self.grain_ways = (np.zeros((exemplars, ROOM, 3), np.float32) for _ in range(2))
         self.counters = np.zeros(6, np.int64)
         self.asked = np.zeros(W.GRAINS_ASKED + exemplars, np.int64)
+        self.spectrum = np.zeros(world.absorption.spectral.shape[1])
         self.radiance = np.zeros((0, 3))
         self.reserve(1)
 
@@ -139,7 +139,7 @@ class Walkers:
             W.Batch(
                 self.walkers[now], self.amounts[now], self.walkers[then], self.amounts[then], self.hits,
                 self.grain_hits, self.starts, self.ways, self.grain_starts, self.grain_ways, self.radiance,
-                self.counters, self.asked,
+                self.counters, self.asked, self.spectrum,
             )
             for now, then in ((0, 1), (1, 0))
         ]  # fmt: skip
@@ -148,7 +148,7 @@ class Walkers:
         if self.hits is not self.near_hits:
             self.near_batches = [Handle(batch._replace(hits=self.near_hits)) for batch in batches]
 
-    def follow(self, job: T.Job, pixels: int, stop: threading.Event) -> np.ndarray:
+    def follow(self, job: transport.Job, pixels: int, stop: threading.Event) -> np.ndarray:
         """Return the radiance (pixels, spp, 3) of the samples of a job, of so many pixels.
 
         Once `stop` is set it is worthless.
@@ -164,16 +164,16 @@ class Walkers:
             live = self.turn(live)
         return self.radiance[:total].reshape(pixels, job.spp, 3).copy()
 
-    def spawn(self, live: int, job: T.Job, first: int, count: int) -> None:
+    def spawn(self, live: int, job: transport.Job, first: int, count: int) -> None:
         """Start walkers, behind the first `live` of ``walkers[0]``, for samples first .. first + count - 1 of a job."""
-        T.spawn(self.batches[0], live, job, first, count)
+        transport.spawn(self.batches[0], live, job, first, count)
 
     def turn(self, live: int) -> int:
         """Take the first `live` of ``walkers[0]`` as far as they come without the ray engine, ask it, and return how
         many go on; ``walkers[1]`` then holds what they were, those that have ended as they ended."""
         if self.answered:
             packed.answer(self.arrays, self.batches[0], live)
-        T.advance(self.near, self.arrays, self.near_batches[0], self.batches[0], live)
+        transport.advance(self.near, self.arrays, self.near_batches[0], self.batches[0], live)
         live, rays = int(self.asked[W.LIVE]), int(self.asked[W.ASKED])
         if rays:
             self.place.hits(self.starts[:rays], self.ways[:rays], self.near_hits.T)
@@ -245,10 +245,10 @@ def measure(
     goal = Goal(spp, seconds, target_error)
     threads = threads or os.cpu_count() or 1
     stop, halt = stop or threading.Event(), threading.Event()
-    met = world.media.traits.packed and bool(world.scene.media) and world.lights.sampled  # by chance alone
+    met = world.media.singles > 0 and bool(world.scene.media) and world.lights.sampled  # by chance alone
     sums, count = Sums(width, height, kurtosis_of(world.lights) if met else 0.0), width * height
     pool = [Walkers(world) for _ in range(threads)]
-    pool[0].follow(T.Job(camera, 0, 1, 0, seed), 1, halt)  # compiles, outside the time
+    pool[0].follow(transport.Job(camera, 0, 1, 0, seed), 1, halt)  # compiles, outside the time
     for walkers in pool:
         walkers.counters[:] = 0
     free = list(pool)
@@ -257,7 +257,7 @@ def measure(
     def follow(block: Portion) -> np.ndarray:
         mine = free.pop()
         try:
-            return mine.follow(T.Job(camera, block.pixel, block.number, block.sample, seed), block.pixels, halt)
+            return mine.follow(transport.Job(camera, block.pixel, block.number, block.sample, seed), block.pixels, halt)
         finally:
             free.append(mine)
 
@@ -363,8 +363,8 @@ class Sums:
     def add(self, block: Portion, radiance: np.ndarray) -> None:
         """Add the radiance (pixels, number, 3) of a block."""
         own = slice(block.pixel, block.pixel + block.pixels)
-        self.total[own] += radiance.sum(axis=1)
-        self.squares[own] += (radiance**2).sum(axis=1)
+        self.total[own] += np.einsum("ijk->ik", radiance)  # four times sooner than sum, in the same order
+        self.squares[own] += np.einsum("ijk,ijk->ik", radiance, radiance)
         self.moments.add(own, self.samples[own], radiance)
         self.samples[own] += block.number
 

@@ -84,15 +84,15 @@ class Moments:
 
     def add(self, own: slice, before: np.ndarray, radiance: np.ndarray) -> None:
         """Add radiance (pixels, number, 3) of pixels that had so many samples `before`."""
-        value = radiance @ np.full(3, 1.0 / 3.0)
+        value = (radiance[..., 0] + radiance[..., 1] + radiance[..., 2]) / 3.0
         number = value.shape[1]
         fresh = before == 0
         self.first[own][fresh] = value[fresh, 0]
         above = value - self.first[own][:, None]
         squares = above * above
         powers = self.powers[:, own]
-        powers[0] += above.sum(axis=1)
-        powers[1] += squares.sum(axis=1)
+        powers[0] += np.einsum("ij->i", above)
+        powers[1] += np.einsum("ij->i", squares)
         powers[2] += np.einsum("ij,ij->i", squares, above)
         powers[3] += np.einsum("ij,ij->i", squares, squares)
         above -= (powers[0] / (before + number))[:, None]

@@ -1,4 +1,4 @@
-"""A scene at one level of detail, as the arrays that `transport` follows light through.
+"""World: a scene at one level of detail, as the arrays that `transport` follows light through.
 
 Media become numbers in `media`; how light uses them is `transport`, pictures are `render`. The levels, cheapest first:
 isotropic (point scatterers, similarity), volume-hg (one Henyey-Greenstein lobe), volume (tabulated deflections),
@@ -15,7 +15,7 @@ from typing import assert_never
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.data.sampler import Tables, compile_tables
 from tsdf.data.table import Table
 from tsdf.errors import SceneError, TSDFError, UsageError
@@ -252,7 +252,7 @@ def build(
             return spec.table
         file = os.path.realpath(spec.table)  # each file once, by whatever name
         if file not in read:
-            read[file] = format.read(spec.table)
+            read[file] = tsdf_format.read(spec.table)
         return read[file]
 
     tables = [table_of(grain) for medium in scene.media for grain in medium.grains]
@@ -269,8 +269,11 @@ def build(
                     f"build it with {records.option}"
                 )
     memory = _memory(scene, tables if traits.remembers or traits.answered else [], traits.remembers)
+    layers = []
     for number, (medium, boundary) in enumerate(zip(scene.media, made.boundaries, strict=True), 1):
         extent = _extent(medium, boundary.vertices if boundary is not None else None)
+        sticks_out = medium.inside == "centres" and boundary is None
+        layers.append(extent / medium.radius - (0.0 if sticks_out else 2.0))
         if 2.0 * medium.radius > extent and medium.inside == "grains":
             notes.append(
                 f"{scene.name}: {called('medium', number, medium.name)}: a grain of diameter {2.0 * medium.radius:g} "
@@ -292,7 +295,7 @@ def build(
             "tell; widen the sun or light by a smooth sky"
         )
     if singles and not traits.packed:
-        notes += hybrid_notes(scene, tables)
+        notes += hybrid_notes(scene, tables, layers)
     grains = nothing_packed(len(scene.media), len(tables))
     if singles and scene.media:
         grains = packed(scene, tables, traced=not traits.answered)

@@ -1,4 +1,4 @@
-"""The colour of grains in bulk: what a deep medium or a slab of them reflects, and the absorption that gives a colour.
+"""Deep media: the colour of grains in bulk, or in a slab, and the absorption that gives a colour.
 
 Point scatterers with the table's own deflections, as level volume has them, in plane layers under diffuse light, by
 doubling [1] with delta-M scaling [2]. Absorption is sigma_a R, the table's. A deep medium has no length in it, so that

@@ -1,4 +1,4 @@
-"""The levels of detail, best first: what each of them is, for whoever asks, kernels included."""
+"""Levels of detail, best first: what each of them is, for whoever asks, kernels included."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Grains in bulk: the free path between them and the parameters of the homogeneous medium that stands for them.
+"""Medium of grains: the free path between them, and the parameters of the homogeneous medium that stands for them.
 
 The statistics of a table and the packing fraction of the bounding spheres go in, lengths in scene units come out.
 What one grain does to light is `table`, the packed grains themselves are `packing`, walks through the medium are not

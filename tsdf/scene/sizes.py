@@ -5,6 +5,7 @@ Lengths in here are in units of the bounding radius R or in scene units, densiti
 have one R; volumes, surfaces and projected areas are means over the number of grains, dimensions those of the largest.
 """
 
+import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -255,7 +256,9 @@ def check_words(said: Mapping[str, float], amount_needed: bool = True) -> None:
     """
     for word, value in said.items():
         if word not in WORDS:
-            raise UsageError(f"unknown size or amount {word!r}; there are {', '.join(WORDS)}")
+            near = difflib.get_close_matches(str(word), WORDS, 1)
+            hint = f"did you mean {near[0]!r}? " if near else ""
+            raise UsageError(f"unknown size or amount {word!r}; {hint}there are {', '.join(WORDS)}")
         if not 0.0 < value < math.inf:
             raise UsageError(f"{word} must be a finite number > 0, not {value:g}")
     for kind, words in (("size", SIZES), ("amount", AMOUNTS)):

@@ -1,4 +1,4 @@
-"""Random packings of equal hard spheres in a periodic cube, and the straight lines through them.
+"""Packing: equal hard spheres at random in a periodic cube, and the straight lines through them.
 
 The truth that models of granular media are measured against; what stands in the spheres, and how light goes on, is
 not here. Lengths are in units of the spheres' radius. Tile (0, 0, 0) is the cube [0, side)^3 and tiles repeat for ever.

@@ -1,4 +1,4 @@
-"""How right each level is where it can be told exactly: diffusion in the bulk, and slabs, against packed grains.
+"""Accuracy: how right each level is where it can be told exactly; bulk diffusion and slabs, against packed grains.
 
 What is measured is `experiment`; here it is done for every level, fraction and slab. Errors of packed grains come from
 the paths and from the spread over packings. Errors of whole pictures are `compare`'s, charts `plots`'.
@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from tsdf.data import format
+from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
 from tsdf.errors import TSDFError, UsageError
 from tsdf.scene import levels as L
@@ -241,7 +241,7 @@ def _checked(
         raise UsageError(f"seconds are a finite number above 0, not {seconds:g}")
     if paths is not None and paths < 64:
         raise UsageError(f"paths are a whole number of at least 64, not {paths}")
-    return grain.table if isinstance(grain.table, Table) else format.read(grain.table)
+    return grain.table if isinstance(grain.table, Table) else tsdf_format.read(grain.table)
 
 
 def _lacks(level: str, table: Table, notes: list[str]) -> bool:

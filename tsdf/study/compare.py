@@ -1,4 +1,4 @@
-"""Every level of a scene against single grains: what each gets wrong, and what it costs.
+"""Comparison: every level of a scene against single grains, what each gets wrong, and what it costs.
 
 The reference is the mean of the explicit level over several packings, so its own noise, the grains' places included, is
 known per pixel from the packings' spread. Noise is taken off squared differences rather than left in, which needs
@@ -239,7 +239,8 @@ def compare(
     levels : sequence of str
         The reference's own is rendered in any case.
     spp : int, optional
-        Samples per pixel of each level, and of each packing unless `reference_seconds` is given; at least 2.
+        Samples per pixel of each level, and of each packing unless `reference_seconds` is given; at least 2. A level of
+        packed grains that is not the reference is the mean of as many other packings, for they all differ.
     seconds : float, optional
         About the time of each level instead [s]; 10 if neither is given.
     reference_seconds : float, optional
@@ -282,7 +283,8 @@ def compare(
     better = REFERENCES[: REFERENCES.index(level)]  # impossible, and noted
     others = [name for name in LEVELS if name in levels and name not in (level, *better)]
     stop = stop or threading.Event()
-    series = _Series(scene, level, notes, seed, threads, packings + len(others), progress, done, stop)
+    jobs = packings + sum(packings if _varies(scene, name) else 1 for name in others)
+    series = _Series(scene, level, notes, seed, threads, jobs, progress, done, stop)
     try:
         try:
             series.pack(world, packings, spp, reference_seconds)
@@ -293,7 +295,7 @@ def compare(
         for name in others:
             if stop.is_set():
                 break
-            series.judge(name, spp, seconds)
+            series.judge(name, packings, spp, seconds)
     except KeyboardInterrupt:
         stop.set()
     rows = tuple(series.rows)
@@ -337,7 +339,7 @@ class _Series:
         """Render the reference with several packings, the first of which is `world`'s, in `seconds` in all."""
         self.world = world
         for k in range(packings):
-            if k and self.level == "explicit" and self.scene.media:
+            if k and _varies(self.scene, self.level):
                 self.world = build(_taken(_repacked(self.scene, k), self.level), self.level)
             time = seconds and seconds / packings
             what = f"{self.level}, picture {k + 1} of {packings}"
@@ -363,21 +365,35 @@ class _Series:
                     "pixels; a small sun it finds by chance alone, a wide one or an environment more easily"
                 )
             assert self.world is not None
-            spread = np.var([p.rgb for p in references], axis=0, ddof=1) / len(references)
-            self._keep("reference", self.world, replace(self.rows[0].picture, variance=spread), level)
+            mean = replace(self.rows[0].picture, variance=_spread(references))
+            self._keep("reference", self.world, mean, level)
 
-    def judge(self, name: str, spp: int | None, seconds: float | None) -> None:
-        """Add the row of another level, or why there is none."""
-        try:
-            world = build(_taken(self.scene, name), name)
-        except TSDFError as error:
-            self.notes.append(f"{name} is skipped: {error}")
-            self.begun += 1
+    def judge(self, name: str, packings: int, spp: int | None, seconds: float | None) -> None:
+        """Add the row of another level, or why there is none; of so many packings that the reference has not, where
+        its picture is one of single grains."""
+        several = packings if _varies(self.scene, name) else 1
+        pictures: list[Picture] = []
+        for k in range(several):
+            try:
+                scene = _repacked(self.scene, packings + k) if several > 1 else self.scene
+                world = build(_taken(scene, name), name)
+            except TSDFError as error:
+                self.notes.append(f"{name} is skipped: {error}")
+                self.begun += several - k
+                return
+            what = name if several == 1 else f"{name}, picture {k + 1} of {several}"
+            picture = self._shot(world, k, what, spp, seconds and seconds / several)
+            if picture is not None:
+                pictures.append(picture)
+            if self.stop.is_set():
+                break
+        if len(pictures) < min(several, 2):
             return
-        picture = self._shot(world, 0, name, spp, seconds)
-        if picture is not None:
-            self.rows.append(Row(name, picture, difference(picture, self.references) if self.lit else None))
-            self._keep(name, world, picture, name)
+        picture = pictures[0]
+        if several > 1:  # what its packings differ by is noise, too
+            picture = replace(pooled(pictures), variance=_spread(pictures))
+        self.rows.append(Row(name, picture, difference(picture, self.references) if self.lit else None))
+        self._keep(name, world, picture, name)
 
     @property
     def lit(self) -> bool:
@@ -401,6 +417,16 @@ class _Series:
         samples = _affordable(world, spp, seconds, own, self.threads, self.stop)
         picture = render.render(world, samples, None, None, own, self.threads, part, self.stop)
         return picture if not picture.interrupted or np.isfinite(picture.variance).all() else None
+
+
+def _varies(scene: Scene, level: str) -> bool:
+    """Return whether a picture is of one packing, and another of another."""
+    return MODELS[level].traits.packed and bool(scene.media)
+
+
+def _spread(pictures: Sequence[Picture]) -> np.ndarray:
+    """Return the variance of the mean of pictures, from what they differ by."""
+    return np.asarray(np.var([picture.rgb for picture in pictures], axis=0, ddof=1) / len(pictures))
 
 
 def _affordable(
@@ -509,7 +535,7 @@ def csv_text(comparison: Comparison) -> str:
 def markdown(comparison: Comparison) -> str:
     """Return the report: what was compared, the table, what its columns mean, notes."""
     c, camera = comparison, comparison.scene.camera
-    kind = "packings" if c.reference == "explicit" else "pictures"
+    kind = "packings" if _varies(c.scene, c.reference) else "pictures"
     title = c.scene.name.replace("|", r"\|")
     text = [
         f"# {title}: error against time",

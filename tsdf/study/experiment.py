@@ -1,4 +1,4 @@
-"""Light sent into packed grains or what stands for them, path by path: diffusion in the bulk, and slabs.
+"""Experiments: light sent into packed grains or what stands for them, path by path; bulk diffusion, and slabs.
 
 Paths are followed one by one to where they end, so that one run of a slab gives reflectance, transmittance, and how
 far from the beam light comes out. What levels make of it beside each other is `accuracy`, pictures are `render`'s.
@@ -20,7 +20,7 @@ from tsdf.picture.world import World, beam, build
 from tsdf.scene.scene import Absorption, Camera, ConstantLight, GrainSpec, MediumSpec, Render, Scene, Slab, Sphere
 from tsdf.spheres.around import around_of
 from tsdf.spheres.packing import cells_of, pack
-from tsdf.walk import transport as T
+from tsdf.walk import transport
 from tsdf.walk import walker as W
 
 WIDE = 300.0  # [R] width of beams, so that they see many places of a packing
@@ -93,7 +93,7 @@ class Passed(NamedTuple):
 
 
 def trips(
-    world: World, camera: T.Camera, first: int, paths: int, seed: int,
+    world: World, camera: transport.Camera, first: int, paths: int, seed: int,
     heard: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
     aim: Callable[[np.ndarray], None] = lambda new: None,
 ) -> tuple[int, int, float]:  # fmt: skip
@@ -113,7 +113,7 @@ def trips(
     mine = Walkers(world)
     began = time.thread_time()
     mine.reserve(paths)
-    job = T.Job(camera, 0, paths, first, seed)
+    job = transport.Job(camera, 0, paths, first, seed)
     spawned, live = 0, 0
     while live or spawned < paths:
         if live <= SLOTS // 2 and spawned < paths:
@@ -137,7 +137,9 @@ def trips(
     return events, events - int(mine.counters[W.LEAPT]) + int(mine.counters[W.LEAPS]), seconds
 
 
-def _batch(world: World, camera: T.Camera, first: int, paths: int, seed: int, marks: int) -> tuple[np.ndarray, Ends]:
+def _batch(
+    world: World, camera: transport.Camera, first: int, paths: int, seed: int, marks: int
+) -> tuple[np.ndarray, Ends]:
     """Follow paths to their end, or past their limit of events so often; return as `follow` does."""
     places = np.zeros((paths, marks, 3))
     start, place, way = (np.zeros((paths, 3)) for _ in range(3))
@@ -159,7 +161,7 @@ def _batch(world: World, camera: T.Camera, first: int, paths: int, seed: int, ma
 
 
 def follow(
-    world: World, camera: T.Camera, paths: int, seed: int = 0, marks: int = 1, threads: int | None = None,
+    world: World, camera: transport.Camera, paths: int, seed: int = 0, marks: int = 1, threads: int | None = None,
     first: int = 0,
 ) -> tuple[np.ndarray, Ends]:  # fmt: skip
     """Follow paths of a camera's first pixel to where they end; the same for any number of threads.
@@ -201,7 +203,7 @@ class Experiment:
     """Paths through a world, and the numbers (paths, q) that are read off where they were and ended."""
 
     world: World
-    camera: T.Camera
+    camera: transport.Camera
     marks: int
     read: Callable[[np.ndarray, Ends], np.ndarray]
 

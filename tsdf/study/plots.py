@@ -1,4 +1,4 @@
-"""Pictures of tables, by matplotlib, which is imported here and nowhere else, and only when a picture is drawn.
+"""Plots: pictures of tables by matplotlib, which is imported only when one is drawn.
 
 Figures are made without pyplot, so nothing global changes, and `save` writes the same bytes for the same table.
 """
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from tsdf.data.blocks import BY_NAME
 from tsdf.data.table import Table
 from tsdf.errors import UsageError
 from tsdf.files import replacing
@@ -432,8 +433,7 @@ def _conditional(figure: Any, axes: Any, table: Table, name: str, label: str, ti
     axes.set_xlabel(r"$\cos\theta$")
     axes.set_ylabel(label)
     axes.set_title(title)
-    unit = "rad" if name == "p_phi" else "R"
-    figure.colorbar(image, ax=axes, label=f"density [1/{unit}]", pad=0.02, extend="both")
+    figure.colorbar(image, ax=axes, label=f"density [1/{BY_NAME[name].unit}]", pad=0.02, extend="both")
 
 
 def _lit(density: np.ndarray) -> np.ma.MaskedArray:

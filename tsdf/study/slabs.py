@@ -3,8 +3,8 @@
 A path keeps the length of grain material it went through, so exp(-sigma_a length) is what is left of it at any
 wavelength; it is followed with the absorption of the wavelength that is absorbed least. Only n cannot be changed
 afterwards: paths are followed at the index of up to three tables of a family, the rest is their polynomial. Ground
-under the slab is added exactly, from what the slab does to diffuse light. Of long paths few are followed to their end
-(`_thin`): they count only where light comes back nearly whole. Approximations to compare with are `streams`.
+under the slab is added exactly, from what the slab does to diffuse light. Deep down paths leap; where they cannot, few
+of the long ones are followed to their end (`_thin`). Approximations to compare with are `streams`.
 """
 
 import math
@@ -23,12 +23,12 @@ from tsdf.picture.media import DARKEST
 from tsdf.picture.world import World, beam, build
 from tsdf.sampling import mix, unit
 from tsdf.scene.levels import LEVELS
-from tsdf.scene.medium import Component, FreePath, free_path, volume_parameters
+from tsdf.scene.medium import Component, free_path, volume_parameters
 from tsdf.scene.scene import Absorption, GrainSpec, Slab
 from tsdf.study import streams
 from tsdf.study.experiment import WIDE, scene_of, trips
 from tsdf.study.spectra import Family, Spectrum, absorbed, lagrange
-from tsdf.walk import transport as T
+from tsdf.walk import transport
 
 GROUPS = 32  # of paths, whose spread tells the error
 CHUNK = 4096  # paths that one thread follows at a time
@@ -39,6 +39,7 @@ CLEAR = 5.0  # [R] above the slab where light starts
 BINS = 256  # of the logarithm of the matter crossed
 LENGTHS = np.concatenate(([0.0], np.geomspace(1e-4, 1e12, BINS)))  # [R], or grains met
 LATTICE = (0.7548776662466927, 0.5698402909980532)  # inverse powers of the root of a^3 = a + 1
+FAINT = 1e-6  # [1/R] an absorption coefficient for which free paths are taken
 CROSSINGS = 2  # that a path counts among the grains met: its way into the slab and out
 LONG = 512  # grains met between two times that a path may be given up
 APART = np.uint64(0x3C6EF372FE94F82B)  # from other uses of a walker's key
@@ -248,33 +249,28 @@ class Paths:
         thickness = request.thickness
         if math.isinf(thickness):
             thickness = depth_of(table, request.packing_fraction, float(x.min()))
-        # the scene is told of a strong absorption, so that nobody is afraid of long paths; then it gets its own
+        deep = math.isinf(request.thickness) and not request.depths
+        # free paths and phase functions are those of grains that hardly absorb; how much of it is seen to afterwards
         world = build(
             scene_of(
-                Slab(-thickness, 0.0), GrainSpec(table, absorption=Absorption("grey", (1.0,)), mesh=request.mesh),
+                Slab(-thickness, 0.0), GrainSpec(table, absorption=Absorption("grey", (FAINT,)), mesh=request.mesh),
                 request.packing_fraction,
             ),
             request.level,
+            leap=None if deep else 0.0,
         )  # fmt: skip
         kept = np.maximum(absorbed(table, x)[0], DARKEST)
         stretch = np.zeros((2, len(x)))
         rows = [np.log(kept) if traits.points else -x]
-        path: FreePath = free_path(component, request.packing_fraction)
-        media = world.media
+        media = world.media if world.leap else world.media._replace(limit=1 if request.depths else LONG)
         if traits.similar:
-            free = 1.0 / (lossless.sigma_t * (1.0 - lossless.g))
             rows.append(-lossless.sigma_t * lossless.g * (1.0 - kept))
-        elif traits.spheres:
-            free = path.lambda_beta
-        else:
-            free = 1.0 / lossless.sigma_t
-            if math.isfinite(request.thickness):  # of a half-space only albedo and phase function count
+        elif not traits.spheres and not deep:  # of a half-space only albedo and phase function count
+            if math.isfinite(request.thickness):
                 ratio = extinction(table, request.packing_fraction, kept) / lossless.sigma_t
                 stretch = np.stack([np.log(ratio), -(ratio - 1.0) * lossless.sigma_t])
-            media.travel[:] = 1
+            media = media._replace(travel=np.ones(1, np.int64))
             rows.append(np.zeros(len(x)))
-        media.free[:] = free
-        media.g[:] = lossless.g
         exponents = np.stack(rows)
         best = int(np.argmax(exponents[0]))
         absorption = world.absorption._replace(
@@ -285,7 +281,7 @@ class Paths:
         depths = request.depths
         bottom = request.thickness if math.isfinite(request.thickness) else request.profile_depth
         return cls(
-            replace(world, absorption=absorption, amounts=len(rows), media=media._replace(limit=1 if depths else LONG)),
+            replace(world, absorption=absorption, amounts=len(rows), media=media),
             cosine, exponents, stretch, np.linspace(0.0, bottom, depths + 1),
             math.isfinite(request.thickness), number, np.zeros((GROUPS, 2, len(x))),
             np.zeros((GROUPS, depths, BINS)), np.zeros(GROUPS, np.int64),
@@ -296,7 +292,7 @@ class Paths:
         """Height of the slab's upper side, relative to the scene's centre."""
         return -float(self.world.place.centre[2])
 
-    def camera(self) -> T.Camera:
+    def camera(self) -> transport.Camera:
         """Return the beam, or what `_diffuse` turns into diffuse light."""
         cosine = 1.0 if self.cosine is None else self.cosine
         way = np.array([math.sqrt(1.0 - cosine**2), 0.0, -cosine])
@@ -318,7 +314,8 @@ class Paths:
         def heard(those: np.ndarray, crossed: np.ndarray, able: np.ndarray) -> np.ndarray:
             number = those["sample"]
             met[number] += those["events"]
-            able = able & _thin(those, able, met[number])
+            if not world.leap:
+                able = able & _thin(those, able, met[number])
             if profiled:
                 layer = np.searchsorted(self.edges, np.maximum(top - those["p"][:, 2], 0.0), side="right") - 1
                 if self.finite:  # what leaves below is beyond the last

@@ -19,19 +19,8 @@ from tsdf.compiled import njit
 from tsdf.errors import GrainError, SceneError
 from tsdf.grain.grains import first_hit, grain_from_mesh, triangle_scene
 from tsdf.grain.meshes import read_mesh
-from tsdf.scene.scene import (
-    FARTHEST,
-    SMALLEST,
-    Box,
-    MediumSpec,
-    Mesh,
-    Rectangle,
-    Scene,
-    Slab,
-    Sphere,
-    SurfaceSpec,
-    called,
-)
+from tsdf.scene.keys import FARTHEST
+from tsdf.scene.scene import SMALLEST, Box, MediumSpec, Mesh, Rectangle, Scene, Slab, Sphere, SurfaceSpec, called
 from tsdf.vectors import KERNEL, dot, step
 from tsdf.walk.grid import GRAZING, Grid, free_around, grid_of, march
 from tsdf.walk.room import BALL, BOX, CLOSED, MESH, OPEN, SLAB, Room, exact_depth, room_of
@@ -95,7 +84,8 @@ def exact_hit(kind, shape, p, d):
             if not low < 0.0 < high:
                 return math.inf, False, (0.0, 0.0, 0.0)
             continue
-        a, b = low / d[k], high / d[k]
+        each = 1.0 / d[k]
+        a, b = low * each, high * each
         if d[k] < 0.0:
             a, b = b, a
         if a > near:

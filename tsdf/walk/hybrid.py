@@ -19,6 +19,7 @@ from tsdf.walk import memory as M
 from tsdf.walk.walker import UNKNOWN
 
 ALL = 2**31 - 1  # grains met one by one: more than a path has
+LEAST_LAYER = 4.0  # [R] of centres
 LEAST_COSINE = 0.2  # mean cosine of grains below which light often comes back to a grain; of mirrors it is 0
 
 
@@ -58,10 +59,19 @@ def singles_of(scene: Scene, level: str) -> int:
     return ALL if traits.packed else grains
 
 
-def hybrid_notes(scene: Scene, tables: Sequence[Table]) -> list[str]:
-    """Return what is to be said of media whose first grains, of these tables in turn, hand over to an average."""
+def hybrid_notes(scene: Scene, tables: Sequence[Table], layers: Sequence[float]) -> list[str]:
+    """Return what is to be said of media whose first grains hand over to an average.
+
+    Parameters
+    ----------
+    scene : Scene
+    tables : sequence of Table
+        Of all components of all media in turn.
+    layers : sequence of float
+        How thin the layers are in which the centres of each medium's grains lie [R].
+    """
     notes, at = [], 0
-    for number, medium in enumerate(scene.media, 1):
+    for number, (medium, layer) in enumerate(zip(scene.media, layers, strict=True), 1):
         own = tables[at : at + len(medium.grains)]
         at += len(own)
         where = f"{scene.name}: {called('medium', number, medium.name)}"
@@ -70,5 +80,10 @@ def hybrid_notes(scene: Scene, tables: Sequence[Table]) -> list[str]:
             notes.append(
                 f"{where}: grains that send so much light back (mean cosine {g:.2g}) are met again, which no chain "
                 "knows; take level explicit"
+            )
+        if layer <= LEAST_LAYER:
+            notes.append(
+                f"{where}: a layer of {max(layer, 0.0):.2g} R of centres is nothing but single grains; take level "
+                "explicit, which is as fast there"
             )
     return notes

@@ -301,9 +301,9 @@ def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of
         centre = step(step(p, radius * along, d), -radius * b, t)
         column = min(int(b * b * memory.columns[c]), memory.columns[c] - 1)
         there, hit = True, memory.hit[c, column]
-        if not w.shadow:  # its record, should it be met, comes while the room is looked at
-            fetch(memory.grains[c, column, int(unit(mix(key + (TWICE if hit < 1.0 else GOLDEN))) * memory.kept[c])])
         if bound <= 2.0 * radius or not sure:
+            if not w.shadow:  # its record, should it be met, comes while the room is looked at
+                fetch(memory.grains[c, column, int(unit(mix(key + (TWICE if hit < 1.0 else GOLDEN))) * memory.kept[c])])
             if sure:
                 bound = max(bound, clearance(g, m, p))
             if bound <= 2.0 * radius or not sure:

@@ -611,7 +611,11 @@ def fly(world, batch, w, amounts):
         if w.events >= media.limit:
             batch.counters[TRUNCATED] += 1
             return ENDED
-        return escape(world, batch, w, amounts) if home != NONE and alone(g, home) else LOOK
+        if alone(g, 0):
+            if home != NONE:
+                return escape(world, batch, w, amounts)
+            w.medium = 0
+        return LOOK
     return escape(world, batch, w, amounts)
 
 
