@@ -148,7 +148,7 @@ def test_stops(folder: Path) -> None:
         (["--seconds", "0"], 2, "--seconds"),
         (["--seconds", "nan"], 2, "--seconds"),
         (["--target-error", "inf"], 2, "--target-error"),
-        (["--leap", "0.5"], 2, "--leap must be 0 or a finite number of at least 1, not 0.5; leaps that short are biased"),
+        (["--leap", "0.5"], 2, "must be 0 or a finite number of at least 1, not 0.5; leaps that short are biased"),
         (["--leap", "nan"], 2, "--leap must be"),
         (["--leap", "2", "--level", "explicit"], 2, "level explicit cannot leap"),
         (["--spp", "1", "--seconds", "1"], 2, "give one"),
