@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 
@@ -21,6 +22,7 @@ import tsdf
 from tsdf.grain.grains import Grain, embree_scene, load_grain
 from tsdf.grain.optics import Optics
 from tsdf.judge import analytic
+from tsdf.make.crew import Crew
 from tsdf.make.scatterometer import Build, Effort, exact_sphere
 from tsdf.make.statistics import cos_theta_edges, table_error
 from tsdf.make.tally import Tally
@@ -117,6 +119,26 @@ def memory(paths: int) -> float:
     return float(done.stdout.split()[-1]) / 1024
 
 
+def tracing(paths: int, threads: int) -> float:
+    """Return the share of a build's rounds that its threads are tracing, rather than waiting for a sum or a save."""
+    spans: list[tuple[float, float]] = []
+    trace = Crew._trace
+
+    def timed(self: Crew, first: int, last: int, side: int) -> int:
+        begin = time.perf_counter()
+        try:
+            return trace(self, first, last, side)
+        finally:
+            spans.append((begin, time.perf_counter()))
+
+    grain = load_grain("snow")
+    with tempfile.TemporaryDirectory() as folder, mock.patch.object(Crew, "_trace", timed):
+        build = Build.start(grain, Optics(ETA), Effort(paths=paths))
+        build.run(grain, threads, part_file=Path(folder) / "x.part")
+    begin, end = min(a for a, _ in spans), max(b for _, b in spans)
+    return sum(b - a for a, b in spans) / (threads * (end - begin))
+
+
 def tables() -> dict[str, float]:
     """Return the seconds that whole-table operations take."""
     sphere = load_grain("sphere")
@@ -205,6 +227,7 @@ def main() -> None:
     text += ["", "| what | measured |", "|---|---|"]
     text += [f"| peak memory, snow, 64 joint records, {n:,} paths | {memory(n):.0f} MB |" for n in (small, large)]
     text += [f"| {name} | {value * 1e3:.0f} ms |" for name, value in tables().items()]
+    text += [f"| share of the time that {n} threads trace | {tracing(40 * paths, n):.3f} |" for n in (2, 16)]
     (options.out / "results.md").write_text("\n".join(text) + "\n")
     print("\n".join(text))
 

@@ -5,12 +5,11 @@ the cost of drawing an event alone (`bench_sampler`). (b) Time to equal variance
 against teleport. Multiply scattered light is the diffuse reflectance of a thick slab of lossless grains: light that a
 grain sends back at its first event is a few per cent of it, and its share is stated. (c) Beside each, a furnace of
 radiance 1 around the same grains, which must read 1: a fast wrong answer shows. (d) The explicit level's rays per
-second against what the ray engine alone makes of the very same rays. (e) Where pictures are made: a cube of 4 R,
-balls of 80 to 80,000 facets and grains of 1/10 to 1/100,000 of them, beside the bulk, and the scenes of scenes/ where
-`make demo` has made their tables. What is compared runs in turn in one process; numbers are medians over rounds,
-ratios medians of the ratios of a round. Where others share the machine, processor time is steadier than the wall's:
-(b) and (d) use it, (a) gives both, and the scaling of two kernels that share nothing, which is what the machine has
-to give.
+second against what the ray engine alone makes of the very same rays. (e) Where pictures are made: a cube of 4 R, balls
+of 80 to 80,000 facets and grains of 1/10 to 1/100,000 of them, beside the bulk, and the scenes of scenes/ where `make
+demo` has made their tables. What is compared runs in turn in one process; numbers are medians over rounds, ratios
+medians of the ratios of a round. Where others share the machine, processor time is steadier than the wall's: (b) and
+(d) use it, (a) gives both, and the scaling of two kernels that share nothing, which is what the machine has to give.
 """
 
 import argparse

@@ -61,10 +61,12 @@ def main(
         family = asked.family(c, work.progress)
     words = asked.words(family)
     found, size = spectra.spectrum(family, c, words.radius), asked.told(words)
+    missed = (
+        f"; polynomials between them may miss {found.between['g'].max():.1g} of g" if len(family.tables) > 1 else ""
+    )
     notes = [
         f"single scattering of {family.tables[0].header['grain']['name']}, {c.material} ({c.source}), {size}",
-        f"tables at n = {', '.join(f'{eta:.5g}' for eta in family.eta)}; polynomials between them may miss "
-        f"{found.between['g'].max():.1g} of g",
+        f"tables at n = {', '.join(f'{eta:.5g}' for eta in family.eta)}{missed}",
         *found.notes,
     ]
     if phase is not None:

@@ -80,7 +80,8 @@ def in_words(table: "Table", words: Mapping[str, float], unit: float | None, amo
         return convert([(table, 1.0)], words, unit, amount_needed)
     except UsageError as error:
         options = ", ".join(OPTIONS[word][0] for word in words)
-        raise UsageError(f"{options}: {error}") from None
+        text = str(error).replace("say material_density", "say --material-density")
+        raise UsageError(f"{options}: {text.replace('packing_fraction = ', '--packing ')}") from None
 
 
 def colour_of(text: str | None) -> tuple[float, ...]:

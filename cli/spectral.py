@@ -167,10 +167,10 @@ class Asked(NamedTuple):
         """Whether tables are given, and no grain."""
         return self.grains[0].lower().endswith(SUFFIX)
 
-    def words(self, family: "Family", density: Mapping[str, float] | None = None, **amount: float) -> "InWords":
+    def words(self, family: "Family", solid: Mapping[str, float] | None = None, **amount: float) -> "InWords":
         """Return sizes in metres, and how much of space is filled where that is said.
 
-        `density` may hold that of the solid.
+        `solid` may hold the density of the material.
 
         Raises
         ------
@@ -178,7 +178,7 @@ class Asked(NamedTuple):
         """
         from tsdf.scene.sizes import DENSITIES, MATERIAL_DENSITY, convert
 
-        said = dict(self.sizes) | dict(density or {}) | amount
+        said = dict(self.sizes) | dict(solid or {}) | amount
         if self.material in DENSITIES:
             said = {MATERIAL_DENSITY: DENSITIES[self.material]} | said
         return convert([(family.tables[0], 1.0)], said, 1.0, amount_needed=bool(amount))

@@ -143,6 +143,16 @@ def sources() -> list[Path]:
     return sorted(path for room in ("tsdf", "cli", "loaders") for path in (ROOT / room).rglob("*.py"))
 
 
+def test_kernels_take_few_arguments() -> None:
+    """At most eight: what belongs together comes as one handle."""
+    many = []
+    for path in modules():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef) and any("njit" in ast.unparse(d) for d in node.decorator_list):
+                many += [f"{named(path)}.{node.name}"] * (len(node.args.args) > 8)
+    assert not many
+
+
 def test_files_are_short() -> None:
     """At most 600 lines, but for those named, and half of them at most 250."""
     lines = {str(path.relative_to(ROOT)): len(path.read_text().splitlines()) for path in sources()}

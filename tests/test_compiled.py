@@ -6,10 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tsdf import compiled
-from tsdf.compiled import PACKAGE, njit, private_folder
+from tsdf.compiled import PACKAGE, fetch, njit, private_folder
 
 INNER = "from tsdf.compiled import njit\n\nSCALE = {}\n\n@njit(cache=True)\ndef f(x):\n    return SCALE * x\n"
 OUTER = "from tsdf.compiled import njit\nfrom tsdf.inner import f\n\n@njit(cache=True)\ndef g(x):\n    return f(x)\n"
@@ -95,18 +96,35 @@ def test_a_numba_without_the_private_option(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_numbers_written_down_are_numbers() -> None:
-    """A kernel that others call with 0, 1 and a count from 0, alone or in a tuple, is compiled once."""
+    """A kernel that others call with 0, 1, a count from 0, or a number of an array, alone or in a tuple, with True and
+    with False, is compiled once."""
 
     @njit()
-    def inner(pair, i):  # type: ignore[no-untyped-def]
-        return pair[0] + i
+    def inner(pair, i, negative):  # type: ignore[no-untyped-def]
+        return -pair[0] - i if negative else pair[0] + i
 
     @njit()
-    def outer(n):  # type: ignore[no-untyped-def]
+    def outer(n, short):  # type: ignore[no-untyped-def]
         total = 0
         for i in range(n):
-            total += inner((total, 1), i) + inner((0, 2), 0) + inner((1, 3), 1)
+            total += inner((total, 1), i, False) + inner((0, 2), 0, False) + inner((1, 3), 1, i < 0)
+        return total + inner((0, 2), short[0], True)
+
+    assert outer(2, np.array([3], np.int32)) == 4
+    assert len(inner.signatures) == 1
+
+
+def test_what_is_fetched_is_what_it_was() -> None:
+    """A hint to the processor changes nothing, whatever the row."""
+
+    @njit()
+    def summed(rows):  # type: ignore[no-untyped-def]
+        total = 0.0
+        for i in range(rows.shape[0]):
+            fetch(rows[i])
+            total += rows[i, 0]
         return total
 
-    assert outer(2) == 7
-    assert len(inner.signatures) == 1
+    for kind in (np.float32, np.float64):
+        rows = np.arange(12.0).reshape(4, 3).astype(kind)
+        assert summed(rows) == 18.0 and (rows == np.arange(12.0).reshape(4, 3)).all()

@@ -63,11 +63,16 @@ def fetch(typing: Any, row: Any) -> Any:
 
 
 def _any(kind: Any) -> Any:
-    """Return the type of an argument, of a number that is written there that of any such number.
+    """Return the type of an argument, of a number or a truth that is written there that of any such, of a short whole
+    number that of a long one.
 
-    Else numba compiles a kernel anew for each number that others call it with, and for each 0 that they count from.
+    Else numba compiles a kernel anew for each number that others call it with, for each 0 that they count from, and for
+    numbers that stand in an array.
     """
-    return types.unliteral(kind) if isinstance(kind, types.IntegerLiteral | types.BaseTuple) else kind
+    if kind == types.int32:
+        return types.int64
+    literal = isinstance(kind, types.IntegerLiteral | types.BooleanLiteral | types.BaseTuple)
+    return types.unliteral(kind) if literal else kind
 
 
 @cache

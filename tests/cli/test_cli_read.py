@@ -201,10 +201,10 @@ def test_medium_without_deflection():
         (("--packing", "0.8"), ("--packing", "0.74")),
         (("--packing", "nan"), ("--packing", "0.74")),
         (("--packing", "0.5", "--radius", "0"), ("--radius", "> 0")),
-        (("--density", "900"), ("--density", "names none that is known", "say material_density")),
+        (("--density", "900"), ("--density", "names none that is known", "say --material-density")),
         (
             ("--density", "900", "--material-density", "900"),
-            ("--density", "would take a packing fraction of 1:", "0.64"),
+            ("--density", "would take a packing fraction of 1:", "Say --packing 0.64:"),
         ),
         (("--ssa", "20"), ("--ssa", "--unit")),
         (("--radius", "1", "--sieve", "2"), ("--radius, --sieve", "give one")),

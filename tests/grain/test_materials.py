@@ -26,6 +26,7 @@ N_PRINTED = [
     ("quartz", 450, 1.55248, 5),
     ("quartz", 550, 1.54595, 5),
     ("quartz", 650, 1.54205, 5),
+    ("quartz", 3000, 1.49956, 5),
     ("salt", 450, 1.55805, 5),
     ("salt", 550, 1.54691, 5),
     ("salt", 650, 1.54076, 5),
@@ -46,6 +47,7 @@ INFRARED = [
     ("ice", 1600, 1.2893, 3.0e-4, 0.15),
     ("ice", 2000, 1.274, 1.6e-3, 0.1),
     ("ice", 3100, 1.28, 0.63, 0.35),
+    ("ice", 4500, 1.344, 0.032, 0.05),
     ("water", 1200, 1.324, 1.2e-5, 0.2),
     ("water", 1940, 1.308, 1.9e-3, 0.1),
     ("water", 2950, 1.29, 0.29, 0.1),
@@ -103,6 +105,12 @@ def test_the_sources_of_water_meet():
     for wavelength, rel_n, rel_k in ((1100.0, 1e-5, 1e-2), (1200.0, 1e-5, 1e-2), (1000.0, 1e-5, 0.05)):
         before, after = (optical_constants("water", wavelength * f) for f in (1 - 1e-4, 1 + 1e-4))
         assert after.n == pytest.approx(before.n, rel=rel_n) and after.k == pytest.approx(before.k, rel=rel_k)
+
+
+def test_the_sources_of_quartz_meet():
+    """Nothing jumps by more than the sources differ."""
+    before, after = (optical_constants("quartz", materials.QUARTZ_FORMULA_NM + d).n for d in (0.0, 1e-6))
+    assert 0.0 < abs(after - before) < 1e-5
 
 
 def test_the_help_states_the_ranges():

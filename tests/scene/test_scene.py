@@ -568,5 +568,5 @@ def test_absorption_that_is_not_known():
         absorption_at(replace(spectrum, kind="rgb"), [500.0])
     with pytest.raises(UsageError, match="metres_per_unit"):
         absorption_at(Absorption("spectral", material="ice"), [500.0])
-    with pytest.raises(UsageError, match="200 to 4000 nm"):
+    with pytest.raises(UsageError, match="200 to 5000 nm"):
         absorption_at(Absorption("spectral", material="ice"), [100.0], 1.0)

@@ -14,7 +14,7 @@ from tsdf.make import scatterometer
 from tsdf.make.scatterometer import Effort
 from tsdf.scene.scene import Box, Camera, ConstantLight, GrainSpec, MediumSpec, Mesh, Scene, Slab, Sphere, SurfaceSpec
 from tsdf.walk import geometry
-from tsdf.walk.geometry import clearance, exact_hit
+from tsdf.walk.geometry import clearance, exact_hit, unmet
 from tsdf.walk.grid import cells_of
 from tsdf.walk.room import BALL, BOX, SLAB, exact_depth, triangle_distance
 
@@ -154,6 +154,41 @@ def test_clearance_is_a_bound(shape, bumpy, table):
     assert (bound <= true * (1.0 + 1e-6)).all()
     assert (bound > 0.5 * true).mean() > 0.5
     assert not (bound <= 0.5 * true).all()
+
+
+@pytest.mark.parametrize("shape", ["mesh", "box"])
+def test_ways_that_are_sure_to_meet_nothing(shape, bumpy, table):
+    """Of ways from places in a medium those that are sure meet nothing, by the ray engine, the depth at their ends and
+    the distance to a ball; nearly all that end well before what is there are sure. Twice as long ways fail."""
+    thing = Mesh(bumpy, 0.3, (0.3, 0.2, 0.1))
+    medium = {"mesh": Mesh(bumpy), "box": Box((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))}[shape]
+    made = placed(table, medium, surfaces=(SurfaceSpec(thing, (0.5,) * 3), SurfaceSpec(Sphere((1.0, 0.0, 0.0), 0.2),
+                  (0.5,) * 3)))  # fmt: skip
+    rng = np.random.default_rng(5)
+    points = rng.uniform(-2.2, 2.2, (3000, 3))
+    points = points[made.inside(0, points)][:800]
+    ways, ends = directions(rng, len(points)), rng.exponential(0.4, len(points))
+    g = made.arrays
+    facets = np.full((g.engines, len(points)), -1, np.int32)
+    made.hits(points.astype(np.float32), ways.astype(np.float32), facets)
+    met = np.full(len(points), math.inf)
+    for row in facets:
+        n, height = g.grid.planes[row, :3], g.grid.planes[row, 3]
+        t = (height - (n * points).sum(axis=1)) / (n * ways).sum(axis=1)
+        met = np.where((row >= 0) & (t < met), t, met)
+    scratch = np.zeros(g.engines, np.int32)
+    sure, known = np.array([unmet(g, scratch, 0, tuple(p), tuple(d), e)
+                            for p, d, e in zip(points, ways, ends, strict=True)]).T  # fmt: skip
+    assert known[sure].all()
+    along = np.einsum("ij,ij->i", g.balls[0, :3] - points, ways)
+    for times, whole in ((1.0, True), (2.0, False)):
+        far = times * ends
+        inside = made.inside(0, points + far[:, None] * ways)
+        nearest = points + np.clip(along, 0.0, far)[:, None] * ways - g.balls[0, :3]
+        free = (met > far * (1.0 - 1e-5)) & inside & (np.linalg.norm(nearest, axis=1) > g.balls[0, 3] * (1.0 - 1e-9))
+        assert free[sure].all() == whole
+        if whole:
+            assert sure[free & (met > 1.01 * far)].mean() > 0.95 and 0.3 < sure.mean() < 0.9
 
 
 def test_distances_bound_those_of_each_cell(bumpy, table):

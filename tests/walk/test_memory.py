@@ -114,7 +114,7 @@ def test_records_for_aimed_light_are_of_their_column(cube: Table) -> None:
 
 
 def test_records_for_aimed_light_are_whole(ball: Table, cube: Table) -> None:
-    """They are records of the table with the entry that these have, so a shadow leaves its grain on the sphere."""
+    """They are records of the table with the entry of these, so that the shadow's grain is left on its sphere."""
     for table in (ball, cube):
         aimed = remembering(0.5, table).aimed
         records, b = remembered(table)

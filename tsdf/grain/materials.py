@@ -27,6 +27,11 @@ WATER_TERMS = (  # Daimon & Masumura 2007, 20.0 C
 QUARTZ_TERMS = (  # Ghosh 1999, ordinary ray
     (1.28604141, 0.0), (1.07044083, 1.00585997e-2), (1.10202242, 100.0),
 )
+QUARTZ_FORMULA_NM = 2053.1  # up to here; the two differ by 8e-6 there, and by 2e-5 at most from 300 to 3000 nm [nm]
+QUARTZ_FAR_TERMS = (  # Radhakrishnan 1951, ordinary ray, 18 C
+    (1.0, 0.0), (0.663044, 0.060**2), (0.517852, 0.106**2), (0.175912, 0.119**2), (0.565380, 8.844**2),
+    (1.675299, 20.742**2),
+)
 SALT_TERMS = (  # NaCl, Li 1976, 297 K
     (1.00055, 0.0), (0.19800, 0.050**2), (0.48398, 0.100**2), (0.38696, 0.128**2), (0.25998, 0.158**2),
     (0.08796, 40.50**2), (3.17064, 60.98**2), (0.30038, 120.34**2),
@@ -43,6 +48,7 @@ ICE_NODES_NM = (  # [nm] Warren & Brandt 2008, 266 K
     2430, 2460, 2500, 2520, 2550, 2565, 2580, 2590, 2600, 2620, 2675, 2725, 2778, 2817, 2833, 2849, 2865, 2882, 2899,
     2915, 2933, 2950, 2967, 2985, 3003, 3021, 3040, 3058, 3077, 3096, 3115, 3135, 3155, 3175, 3195, 3215, 3236, 3257,
     3279, 3300, 3322, 3345, 3367, 3390, 3413, 3436, 3460, 3484, 3509, 3534, 3559, 3624, 3732, 3775, 3847, 3969, 4099,
+    4239, 4348, 4387, 4444, 4505, 4547, 4560, 4580, 4719, 4904, 5000,
 )
 ICE_N = (  # [1], from 400 to 1390 nm one row per 100 nm
     1.3943, 1.3914, 1.3901, 1.3801, 1.3509, 1.3339, 1.3249, 1.3203,
@@ -66,6 +72,7 @@ ICE_N = (  # [1], from 400 to 1390 nm one row per 100 nm
     1.2089, 1.3215, 1.4225, 1.4933, 1.5478, 1.597, 1.6336, 1.6477, 1.6405, 1.6248, 1.6108, 1.5905, 1.5714, 1.5559,
     1.5396, 1.5241, 1.5086, 1.4949, 1.4827, 1.471, 1.4604, 1.4502, 1.4411, 1.4328, 1.4146, 1.3924, 1.385, 1.375,
     1.3623, 1.3526,
+    1.3447, 1.3406, 1.3401, 1.3412, 1.3444, 1.3473, 1.3482, 1.3491, 1.347, 1.3379, 1.3325,
 )
 ICE_K = (  # [1], same nodes; the source holds 2e-11 from 202 to 390 nm
     9.565e-11, 3.249e-11, 2e-11, 2e-11, 2e-11, 2e-11, 2e-11, 2e-11,
@@ -91,6 +98,7 @@ ICE_K = (  # [1], same nodes; the source holds 2e-11 from 202 to 390 nm
     0.347, 0.388, 0.438, 0.493, 0.554, 0.612, 0.625, 0.593, 0.539, 0.491, 0.438, 0.372, 0.3, 0.238, 0.193, 0.158,
     0.121, 0.103, 0.0836, 0.0668, 0.05312, 0.04286, 0.03523, 0.02887, 0.02347, 0.01921, 0.01586, 0.01326, 0.0113,
     0.008146, 0.006672, 0.006966, 0.008248, 0.01112, 0.01471,
+    0.01867, 0.02411, 0.02656, 0.0299, 0.03179, 0.0309, 0.03007, 0.02883, 0.0194, 0.01347, 0.0124,
 )
 WATER_FORMULA_NM = 1100.0  # up to here n is from the formula [nm]
 WATER_N_NODES_NM = (  # [nm] beyond it Hale & Querry 1973, 25 C
@@ -211,6 +219,13 @@ def table_k(nodes_nm: Sequence[float], values: Sequence[float]) -> Callable[[flo
     return lambda wavelength_nm: math.exp(np.interp(wavelength_nm, nodes_nm, logs))
 
 
+def quartz_n(wavelength_nm: float) -> float:
+    """Return n of quartz, ordinary ray: by Ghosh, beyond `QUARTZ_FORMULA_NM` by Radhakrishnan."""
+    return (sellmeier_n(QUARTZ_TERMS) if wavelength_nm <= QUARTZ_FORMULA_NM else sellmeier_n(QUARTZ_FAR_TERMS))(
+        wavelength_nm
+    )
+
+
 def water_n(wavelength_nm: float) -> float:
     """Return n of water at a wavelength [nm]: the formula, and from 1200 nm on a table; between them a straight line.
 
@@ -225,7 +240,7 @@ def water_n(wavelength_nm: float) -> float:
 
 MEDIA = {
     "ice": Medium(
-        (200.0, 4000.0),
+        (200.0, 5000.0),
         table_n(ICE_NODES_NM, ICE_N),
         table_k(ICE_NODES_NM, ICE_K),
         "Warren & Brandt 2008, doi:10.1029/2007JD009744, 266 K; birefringence ignored",
@@ -238,10 +253,11 @@ MEDIA = {
         "k Hale & Querry 1973, doi:10.1364/AO.12.000555, 25 C, beyond 1000 nm Segelstein 1981, hdl:10355/11599",
     ),
     "quartz": Medium(
-        (198.0, 2053.1),
-        sellmeier_n(QUARTZ_TERMS),
+        (198.0, 3000.0),
+        quartz_n,
         None,
-        "Ghosh 1999, doi:10.1016/S0030-4018(99)00091-7, ordinary ray; birefringence ignored",
+        "Ghosh 1999, doi:10.1016/S0030-4018(99)00091-7, beyond 2053.1 nm Radhakrishnan 1951, doi:10.1007/BF03172255, "
+        "ordinary ray; birefringence ignored",
     ),
     "salt": Medium((200.0, 30000.0), sellmeier_n(SALT_TERMS), None, "NaCl, Li 1976, doi:10.1063/1.555536, 297 K"),
     "glass": Medium(
@@ -267,7 +283,7 @@ def optical_constants(material: str, wavelength_nm: float) -> OpticalConstants:
     Parameters
     ----------
     material : str
-        One of MATERIALS, ends included: ice 200-4000 nm, water 200-4000, quartz (ordinary ray) 198-2053.1,
+        One of MATERIALS, ends included: ice 200-5000 nm, water 200-4000, quartz (ordinary ray) 198-3000,
         salt (NaCl) 200-30000, glass (Schott N-BK7) 300-2500, sucrose 400-700. k is None for quartz, salt and
         sucrose. n of sucrose is that of 589 nm throughout; n of quartz falls by 0.017 over the same range.
     wavelength_nm : float

@@ -57,7 +57,7 @@ class Memory(NamedTuple):
     impact parameter of the exit, path length.
 
     For light that is aimed: aimed (all columns of cos theta, AIMED, 9) float32: records of light deflected so, as in
-    `grains`, and the impact parameter of their entry; met (c,): hit probability.
+    `grains`, and the impact parameter of the entry; met (c,): hit probability.
     """
 
     law: np.ndarray
@@ -146,21 +146,6 @@ def begin(w, memory):
         w.free = memory.radius[m] * u3 * float(memory.law[m, cell, k, 0])
     write(w.t, t)
     w.b = b
-
-
-@njit(forceinline=True, **KERNEL)
-def sent_on(memory, c, column, u, t, d):
-    """Return what a grain of component c does to light along d that meets it on side t, its impact parameter in that
-    column, by the record that u stands for: direction, side and impact parameter of the exit, path length [R]."""
-    grain = memory.grains[c, column, int(u * memory.kept[c])]
-    up = cross(d, t)
-    x, y, z = float(grain[0]), float(grain[1]), float(grain[2])
-    new = step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d)
-    half = 1.5 - 0.5 * dot(new, new)
-    new = (new[0] * half, new[1] * half, new[2] * half)
-    x, y, z = float(grain[3]), float(grain[4]), float(grain[5])
-    t = upright(step(step(step((0.0, 0.0, 0.0), x, t), y, up), z, d), new)
-    return new, t, float(grain[6]), float(grain[7])
 
 
 @njit(**KERNEL)
@@ -456,9 +441,8 @@ def memory_of(
         hit[c, :n] = table.hit
         records[c, :n, :k], entered = remembered(table)
         chosen = np.unravel_index(_aimed(table, k), (n, k))
-        aimed.append(
-            np.concatenate((records[c, :n, :k][chosen], entered[chosen][..., None]), axis=-1, dtype=np.float32)
-        )
+        own = records[c, :n, :k][chosen]
+        aimed.append(np.concatenate((own, entered[chosen][..., None]), axis=-1, dtype=np.float32))
     shares = [np.array([share for _, share in some]) for some in grains]
     return Memory(
         law=law,

@@ -10,12 +10,12 @@ import math
 
 from tsdf.compiled import njit
 from tsdf.sampling import GOLDEN, mix, unit
-from tsdf.spheres.around import entry_of, nearest
+from tsdf.spheres.around import next_around
 from tsdf.spheres.packing import next_sphere
 from tsdf.vectors import KERNEL, dot, frame, step, triple
 from tsdf.walk import explicit as X
 from tsdf.walk.geometry import clearance
-from tsdf.walk.memory import sent_on
+from tsdf.walk.memory import sent
 from tsdf.walk.room import MESH, stands
 from tsdf.walk.walker import DIM, EVENTS, FLY, GRAIN, PATIENCE, TRUNCATED, lives, write
 
@@ -47,12 +47,11 @@ def rove(world, batch, w, amounts):
             size = 1.0 / math.sqrt(b2) if b2 > 1e-18 else 0.0
             t = (t[0] * size, t[1] * size, t[2] * size) if size > 0.0 else frame(d)[0]
             key += GOLDEN
-            d, t, b, length = sent_on(memory, c, column, unit(mix(key)), t, d)
-            n = step((0.0, 0.0, 0.0), b, t)
-            n = step(n, math.sqrt(max(0.0, 1.0 - b * b)), d)
+            grain = memory.grains[c, column, int(unit(mix(key)) * memory.kept[c])]
+            d, _, _, n = sent(grain, d, t)
             slot = media.slot[c]
             if slot >= 0:
-                length *= media.scale[c]
+                length = media.scale[c] * float(grain[7])
                 amounts[slot] += length
                 luck += world.absorption.least[slot] * length
                 if luck < DIM:
@@ -71,16 +70,15 @@ def rove(world, batch, w, amounts):
 
         # The next grain, as long as it is nearer than all else
         bound -= (2.0 + s) * radius
-        found, s = nearest(around, sphere, n, d) if sphere >= 0 else (-1, 0.0)
-        if found >= 0 and sure and (s + 2.01) * radius < bound:
-            s, n, code = entry_of(around, sphere, found, n, d)
-            i, j, k, sphere = i + ((code >> 4) & 3) - 1, j + ((code >> 2) & 3) - 1, k + (code & 3) - 1, code >> 6
+        other = -1
+        if sphere >= 0 and sure and bound > 2.01 * radius:
+            other, di, dj, dk, s, away = next_around(around, sphere, n, d, bound / radius - 2.01)
+        if other >= 0:
+            n, sphere, i, j, k = away, other, i + di, j + dj, k + dk
         else:
             if sphere >= 0:
                 centre = X.centre_of(grains, m, i, j, k, sphere)
             p, passed, fresh = step(centre, radius, n), 0.0, False
-            if sphere >= 0 and s > around.reach:
-                passed = around.reach
             o, c0 = (p[0] / radius, p[1] / radius, p[2] / radius), centre
             while True:
                 s, i, j, k, sphere = next_sphere(cells, o, d, passed, bound / radius)

@@ -1,0 +1,112 @@
+"""tsdf-optics and tsdf-albedo: what they print and write, and what they refuse in one line."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+import tsdf
+from tsdf.cli import albedo, optics
+from tsdf.reference_data.make_checks import CHECKS
+
+CUBE = CHECKS / "cube_memory.tsdf.exr"
+SOME = ("--wavelength-nm", "400:1200:400", "--quiet")
+
+
+def run(command: object, *arguments: object) -> Result:
+    return CliRunner().invoke(command.main, [str(a) for a in arguments])  # type: ignore[attr-defined]
+
+
+def test_optics_says_the_same_everywhere(tmp_path: Path) -> None:
+    """JSON, CSV and the table of numbers agree; phase functions, moments and picture are there."""
+    files = {name: tmp_path / name for name in ("a.csv", "p.txt", "m.csv", "o.png")}
+    result = run(
+        optics, CUBE, *SOME[:2], "--ssa", 20, "--json", "--csv", files["a.csv"], "--phase", files["p.txt"],
+        "--moments", files["m.csv"], "--orders", 8, "--forward", "apart", "--plot", files["o.png"],
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    facts = json.loads(result.stdout)
+    rows = [row for row in csv.reader(files["a.csv"].read_text().splitlines()) if not row[0].startswith("#")]
+    table = {name: [float(row[i]) for row in rows[1:]] for i, name in enumerate(rows[0])}
+    assert table["wavelength_nm"] == facts["wavelength_nm"] == [400.0, 800.0, 1200.0]
+    for name in ("albedo", "g", "g_far", "enhancement", "albedo_error"):
+        assert table[name] == pytest.approx(facts[name], rel=1e-6), name
+    cube = tsdf.read(CUBE)
+    assert facts["g"][0] == pytest.approx(cube.mean_cosine(), abs=1e-4)
+    assert facts["enhancement"][0] == pytest.approx(cube.absorption_enhancement.value, rel=1e-6)
+    assert "n is that of the one table" in " ".join(facts["notes"])
+    moments = np.loadtxt(files["m.csv"], delimiter=",", skiprows=3)
+    assert moments.shape == (9, 4) and (moments[0, 1:] == 1.0).all()
+    assert len(np.loadtxt(files["p.txt"], skiprows=5)) == len(cube.p_theta) - 2
+    assert files["o.png"].read_bytes()[1:4] == b"PNG"
+    text = run(optics, CUBE, *SOME[:2], "--ssa", 20).stdout.splitlines()
+    assert len([line for line in text if not line.startswith("#")]) == 4
+
+
+def test_albedo_says_what_was_asked(tmp_path: Path) -> None:
+    plot, sheet = tmp_path / "a.png", tmp_path / "a.csv"
+    result = run(
+        albedo, CUBE, *SOME, "--level", "teleport-memory", "--packing", 0.4, "--thickness", "2mm", "--angle", 60,
+        "--ground", 0.3, "--profile", 3, "--paths", 2048, "--radius", "0.2mm", "--json", "--plot", plot, "--csv", sheet,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    facts = json.loads(result.stdout)
+    assert facts["paths"] == 2048 and facts["level"] == "teleport-memory" and facts["packing_fraction"] == 0.4
+    assert facts["profile_edges_m"] == pytest.approx([0.0, 2e-3 / 3, 4e-3 / 3, 2e-3])
+    whole = np.array(facts["reflectance"]) + 0.7 * np.array(facts["transmittance"])
+    whole += sum(np.array(facts[f"absorbed_{k}"]) for k in (1, 2, 3))
+    assert whole == pytest.approx(np.ones(3), abs=1e-6)
+    assert facts["reflectance"][0] > facts["reflectance"][2] and all(e > 0.0 for e in facts["reflectance_error"])
+    assert plot.stat().st_size > 10_000 and sheet.read_text().count("\n") > 4
+    dense = json.loads(
+        run(albedo, CUBE, *SOME, "--density", 150, "--paths", 512, "--thickness", "1mm", "--json").stdout
+    )
+    cube = tsdf.read(CUBE)
+    share = cube.header["grain"]["volume"] / (4.0 / 3.0 * np.pi)
+    assert dense["packing_fraction"] == pytest.approx(150.0 / 917.0 / share, rel=1e-6)
+    assert dense["size"].endswith("(by default)")
+
+
+@pytest.mark.parametrize("command", [optics, albedo])
+@pytest.mark.parametrize(
+    ("arguments", "status", "said"),
+    [
+        ((CUBE, "--wavelength-nm", "100"), 2, "200 to 5000 nm"),
+        ((CUBE, "--wavelength-nm", "red"), 2, "give FROM:TO:STEP"),
+        ((CUBE, "--material", "chees"), 2, "unknown material"),
+        ((CUBE, "snow"), 2, "not both"),
+        (("snow", "sand"), 2, "give one GRAIN"),
+        ((CUBE, "--set", "size=1"), 2, "--set shapes a GRAIN"),
+        ((CUBE, "--ssa", 20, "--radius", "1mm"), 2, "each say how large"),
+        ((CUBE, "--radius", "1 furlong"), 2, "is not a length"),
+        ((CUBE, "--ssa", -1), 2, "ssa"),
+        ((CUBE, "--plot", "x.gif"), 2, "a .png or a .pdf"),
+        ((CUBE, "--csv", CUBE), 2, "it is an input"),
+        (("no-such.tsdf.exr",), 1, "no-such.tsdf.exr"),
+        (("no-such-grain",), 1, "neither a file nor a built-in grain"),
+    ],
+)  # fmt: skip
+def test_what_both_refuse(command: object, arguments: tuple[object, ...], status: int, said: str) -> None:
+    result = run(command, *arguments)
+    assert result.exit_code == status, result.output
+    assert said in result.output and result.output.count("\n") == 1, result.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--angle", 90), "below 90"), (("--angle", 30, "--diffuse"), "give one"), (("--ground", 0.5), "--thickness"),
+        (("--ground", 1.5, "--thickness", "1mm"), "0 to 1"), (("--level", "telport"), "did you mean teleport"),
+        (("--error", 0), "--error"), (("--depth", "1mm"), "--profile"), (("--paths", 0), "at least 1"),
+        (("--density", 900), "packing"), (("--packing", 0.9), "0.74"),
+        (("--material", "quartz"), "not known at 300 nm"),
+        (("--level", "teleport-joint"), "--joint 32"), (("--profile", 2000), "1 to 1000"),
+    ],
+)  # fmt: skip
+def test_what_albedo_refuses(arguments: tuple[object, ...], said: str) -> None:
+    result = run(albedo, CUBE, *arguments)
+    assert result.exit_code in (1, 2) and said in result.output, result.output
+    assert result.output.count("\n") == 1
