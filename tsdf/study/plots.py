@@ -347,6 +347,9 @@ def plot_preview(found: Preview, notes: Sequence[str]) -> Any:
         swatch, words = grid[1, 2:]
         swatch.imshow(np.broadcast_to(found.deep_srgb, (3, 4, 3)), aspect="equal")
         swatch.set_title("deep colour")
+        swatch.set_axis_on()  # a frame, for white is the colour of what does not absorb
+        swatch.set_xticks([])
+        swatch.set_yticks([])
         rgb = ", ".join(f"{c:.3f}" for c in found.deep)
         swatch.text(0.0, -0.03, f"linear {rgb}", transform=swatch.transAxes, va="top", weight="bold")
         about = "of a deep medium in white light from everywhere, whatever its packing; any level has it"
