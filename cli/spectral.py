@@ -45,7 +45,7 @@ def metres(context: click.Context, parameter: click.Parameter, value: str | None
     return length
 
 
-def _setting(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
+def setting(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
     pairs = [value.partition("=") for value in values]
     if any(not name or not equals for name, equals, _ in pairs) or len({name for name, _, _ in pairs}) < len(pairs):
         raise click.BadParameter("give NAME=VALUE, each name once", context, parameter)
@@ -68,7 +68,7 @@ def options(command: Command) -> Command:
             click.option("--maximum-dimension", callback=metres, metavar="LENGTH", help="Between any two points."),
             click.option("--sieve", callback=metres, metavar="LENGTH", help="Mesh width that grains just pass."),
             click.option("--ssa", type=float, metavar="X", help="Specific surface area [m2/kg]."),
-            click.option("--set", "settings", multiple=True, callback=_setting, metavar="NAME=VALUE",
+            click.option("--set", "settings", multiple=True, callback=setting, metavar="NAME=VALUE",
                          help="A parameter of a built-in grain; tsdf-build --grains lists them."),
             click.option("--table-paths", callback=whole_number, default=f"{TABLE_PATHS:g}", show_default=True,
                          metavar="N", help="Paths of each table that is made of a GRAIN."),

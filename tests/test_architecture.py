@@ -204,7 +204,8 @@ def test_library_does_not_import_the_command_line() -> None:
 
 
 @pytest.mark.parametrize(
-    "command", ["accuracy", "build", "compare", "export", "info", "merge", "packing", "plot", "render", "validate"]
+    "command",
+    ["accuracy", "build", "compare", "export", "info", "merge", "packing", "plot", "preview", "render", "validate"],
 )
 def test_help_loads_nothing_slow(command: str) -> None:
     """``--help`` and ``--version`` are instant because no array library is loaded for them."""
