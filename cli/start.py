@@ -179,8 +179,8 @@ def _command(name: str) -> Callable[[], None]:
     return run
 
 
-accuracy, albedo, build, compare, export, info, merge, optics, packing, plot, render, validate = map(
+accuracy, albedo, build, compare, export, grains, info, merge, optics, packing, plot, render, validate = map(
     _command,
-    ("accuracy", "albedo", "build", "compare", "export", "info", "merge", "optics", "packing", "plot", "render",
-     "validate"),
+    ("accuracy", "albedo", "build", "compare", "export", "grains", "info", "merge", "optics", "packing", "plot",
+     "render", "validate"),
 )  # fmt: skip

@@ -26,6 +26,8 @@ DOORS = {
     "OpenEXR": {"container", "image"},
     "colour": {"image"},
     "PIL": {"image"},
+    "skimage": {"volumes"},
+    "tifffile": {"volumes"},
     "matplotlib": {"plots", "spectral_plots"},
     "jsonschema": {"container"},
     "yaml": {"constants"},
@@ -204,7 +206,8 @@ def test_library_does_not_import_the_command_line() -> None:
 
 
 @pytest.mark.parametrize(
-    "command", ["accuracy", "build", "compare", "export", "info", "merge", "packing", "plot", "render", "validate"]
+    "command",
+    ["accuracy", "build", "compare", "export", "grains", "info", "merge", "packing", "plot", "render", "validate"],
 )
 def test_help_loads_nothing_slow(command: str) -> None:
     """``--help`` and ``--version`` are instant because no array library is loaded for them."""
