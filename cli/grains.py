@@ -165,7 +165,8 @@ def _csv(rows: list[Row]) -> str:
 
 def _summary(rows: list[Row], found: "Parts", share: float, unit: str, mass: float | None) -> Iterator[str]:
     left = [f"{n} {why}" for n, why in ((found.border, "touch the border"), (found.small, "are too small")) if n]
-    yield f"{len(rows)} grain{'s' * (len(rows) != 1)}; left out: {', '.join(left) or 'none'}; solid fraction {share:.4f}"
+    count = f"{len(rows)} grain{'s' * (len(rows) != 1)}"
+    yield f"{count}; left out: {', '.join(left) or 'none'}; solid fraction {share:.4f}"
     area, volume = sum(row.area for row in rows), sum(row.volume for row in rows)
     ssa = "" if mass is None else f", SSA {area / (volume * mass):.4g} m2/kg"
     low, high = min(row.bounding_radius for row in rows), max(row.bounding_radius for row in rows)

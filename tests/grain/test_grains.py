@@ -80,7 +80,8 @@ def test_cauchy(name, given, hit_probability):
 
 
 CONCAVE = {
-    "bullet_rosette", "column_aggregate", "faceted", "fresh", "hollow_column", "koch_snowflake", "rounded", "sand", "snow",
+    "bullet_rosette", "column_aggregate", "faceted", "fresh", "hollow_column", "koch_snowflake", "rounded", "sand",
+    "snow",
 }  # fmt: skip
 
 
