@@ -10,7 +10,7 @@ def ball_of(table: str) -> dict[str, Any]:
         "render": {"level": "teleport-memory", "spp": 32},
         "light": [
             {"type": "constant", "radiance": [0.25, 0.3, 0.4]},
-            {"type": "sun", "direction": [1, 0.5, -1], "irradiance": [2.4, 2.3, 2.1], "angular_diameter_deg": 5},
+            {"type": "sun", "direction": [-1, -0.7, 1.1], "irradiance": [2.4, 2.3, 2.1], "angular_diameter_deg": 5},
         ],
         "surface": [
             {
