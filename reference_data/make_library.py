@@ -66,7 +66,7 @@ HEAD = """# Ready tables
 Tables of grains that many need, in the public domain (CC0), installed with the package. Their names stand for files:
 
 ```
-tsdf-info sugar --radius 0.5 --packing-fraction 0.6
+tsdf-info sugar --radius 0.5 --packing 0.6
 tsdf-export salt --to npz --out salt.npz
 ```
 

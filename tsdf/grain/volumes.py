@@ -6,7 +6,7 @@ size is given; axes are x, y, z, of .npy in the order of the array, of .tif a sl
 """
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -163,9 +163,7 @@ def parts(solid: NDArray[np.bool_]) -> Parts:
     return Parts(labels, kept.tolist(), border, int(small.sum()))
 
 
-def solids(
-    found: Parts, size: tuple[float, float, float] = (1.0, 1.0, 1.0), smoothing: float = SMOOTHING
-) -> Iterator[Solid]:
+def solids(found: Parts, size: Sequence[float] = (1.0, 1.0, 1.0), smoothing: float = SMOOTHING) -> Iterator[Solid]:
     """Yield each grain as a closed mesh without the stairs of voxels.
 
     Its voxels, 1 inside and 0 outside, are filtered by a Gaussian; the surface is where the field has the value that
