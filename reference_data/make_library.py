@@ -67,7 +67,7 @@ Tables of grains that many need, in the public domain (CC0), installed with the 
 
 ```
 tsdf-info sugar --radius 0.5 --packing 0.6
-tsdf-export salt --to npz --out salt.npz
+tsdf-export salt --to npz --radius 1 --packing 0.6 --out salt.npz
 ```
 
 ```python
