@@ -165,7 +165,11 @@ class Asked(NamedTuple):
     @property
     def tabulated(self) -> bool:
         """Whether tables are given, and no grain."""
-        return self.grains[0].lower().endswith(SUFFIX)
+        from tsdf.data.library import names
+        from tsdf.grain.grains import BUILT_INS
+
+        name = self.grains[0]
+        return name.lower().endswith(SUFFIX) or (name in names() and name not in BUILT_INS and not Path(name).exists())
 
     def words(self, family: "Family", solid: Mapping[str, float] | None = None, **amount: float) -> "InWords":
         """Return sizes in metres, and how much of space is filled where that is said.

@@ -26,6 +26,8 @@ DOORS = {
     "OpenEXR": {"container", "image"},
     "colour": {"image"},
     "PIL": {"image"},
+    "skimage": {"volumes"},
+    "tifffile": {"volumes"},
     "matplotlib": {"plots", "spectral_plots"},
     "jsonschema": {"container"},
     "yaml": {"constants"},
@@ -205,7 +207,22 @@ def test_library_does_not_import_the_command_line() -> None:
 
 @pytest.mark.parametrize(
     "command",
-    ["accuracy", "build", "compare", "export", "info", "merge", "packing", "plot", "preview", "render", "validate"],
+    [
+        "accuracy",
+        "albedo",
+        "build",
+        "compare",
+        "export",
+        "grains",
+        "info",
+        "merge",
+        "optics",
+        "packing",
+        "plot",
+        "preview",
+        "render",
+        "validate",
+    ],  # fmt: skip
 )
 def test_help_loads_nothing_slow(command: str) -> None:
     """``--help`` and ``--version`` are instant because no array library is loaded for them."""
