@@ -162,7 +162,7 @@ def emerge(w, memory, n):
     w.free = memory.radius[m] * gap
 
 
-@njit(**KERNEL)
+@njit(forceinline=True, **KERNEL)
 def connect(world, batch, w, amounts, p, c, share, bound):
     """Send off light that arrives from a light and is deflected into the walker's path by a grain.
 
@@ -284,7 +284,7 @@ def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of
             if bound < 8.0 * mean:
                 bound = max(bound, clearance(g, m, p))
             # The root of how likely the shadow is to arrive: it ends at a grain or not at all, and so costs least
-            share = min(1.0, math.exp(0.5 * (2.0 * radius - bound) / mean))
+            share = math.exp(0.5 * (2.0 * radius - bound) / mean) if 2.0 * radius < bound else 1.0
             key += GOLDEN
             if unit(mix(key)) < share:
                 write(w.d, d)
