@@ -27,6 +27,7 @@ from tsdf.walk.walker import (
     DIM,
     ENDED,
     EVENTS,
+    FAULTS,
     LOOK,
     OTHER,
     PATIENCE,
@@ -228,7 +229,7 @@ def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of
     radius, sampled = memory.radius[m], world.lights.sampled and not w.shadow
     first, last = media.first[m], media.first[m] + media.kinds[m] - 1
     mean, sure = media.free[m], room.whole[m] or room.kind[m] != MESH
-    luck, pdf, steps, met, state = w.luck, w.pdf, 0, 0, LOOK
+    luck, pdf, steps, met, before, state = w.luck, w.pdf, 0, 0, w.events, LOOK
     bound, fresh, spot = 0.0 if once else clearance(g, m, p), True, batch.hits.shape[0] - 1
     if free < 0.0:
         begin(w, memory)
@@ -247,6 +248,9 @@ def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of
                     break
         if steps >= PATIENCE or (sampled and not once and full(batch)):
             state = WAIT
+            if steps >= PATIENCE and met == 0 and w.events == before:  # no grain stands where it has got: out of bounds
+                batch.counters[FAULTS] += 1
+                w.weight, state = 0.0, ENDED
             break
         fresh = False
         steps += 1
