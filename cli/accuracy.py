@@ -17,8 +17,7 @@ from tsdf.cli.common import (
     write_text,
 )
 from tsdf.cli.start import interrupt_status, interrupted, interruptible
-
-MEASURED = ("explicit", "teleport-packed", "teleport-memory", "teleport-joint", "teleport", "volume")
+from tsdf.scene.levels import DETAILED as MEASURED
 
 
 @click.command("tsdf-accuracy", cls=Tool)

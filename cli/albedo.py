@@ -5,10 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from tsdf.cli import spectral
-from tsdf.cli.common import Tool, check_numbers, named_levels, whole_number, working
+from tsdf.cli.common import Tool, check_numbers, named_levels, plain, whole_number, working
 from tsdf.errors import UsageError
+
+COMMANDLINE = ParameterSource.COMMANDLINE
 
 
 @click.command("tsdf-albedo", cls=Tool)
@@ -52,7 +55,11 @@ def main(  # noqa: PLR0913 - an argument for each option
     """
     asked = spectral.Asked.of(grains, said)
     check_numbers(seed, said["threads"], paths=paths)
-    level = named_levels(level, ())[0]
+    level, *others = named_levels(level, (), "--level")
+    if others:
+        raise UsageError(f"--level takes one level, not {1 + len(others)}")
+    if density is not None and click.get_current_context().get_parameter_source("packing") is COMMANDLINE:
+        raise UsageError("--packing and --density both say how much of space is filled: give one")
     if angle is not None and diffuse:
         raise UsageError("--angle and --diffuse both say where the light comes from: give one")
     if angle is not None and not 0.0 <= angle < 90.0:
@@ -69,8 +76,16 @@ def main(  # noqa: PLR0913 - an argument for each option
 
         check_suffix(plot)
 
+    from tsdf.scene.medium import MAX_PACKING_FRACTION
     from tsdf.study import slabs, spectra
 
+    # before tables are made, which takes minutes
+    slabs.Request(level, ground=ground, depths=profile)
+    slabs.check_paths(paths)
+    if not 0.0 < packing <= MAX_PACKING_FRACTION:
+        raise UsageError(f"--packing is above 0 and at most {MAX_PACKING_FRACTION:g}, not {packing:g}")
+    if density is not None and not 0.0 < density < math.inf:
+        raise UsageError(f"--density is a finite number > 0, not {density:g}")
     with working(quiet) as work:
         records = {"memory": {"memory": 64}, "joint": {"joint": 32}}
         needed = slabs.records_of(level)
@@ -101,6 +116,7 @@ def main(  # noqa: PLR0913 - an argument for each option
         f"{result.paths} paths at n = {', '.join(f'{eta:.5g}' for eta in result.eta)}; constants: {c.source}",
         *found.notes,
     ]
+    notes = [plain(note) for note in notes]
     if plot is not None:
         from tsdf.study import plots, spectral_plots
 

@@ -361,8 +361,8 @@ def check_numbers(seed: int | None = None, threads: int | None = None, **counts:
             raise UsageError(f"--{name} is a whole number of at least 1, not {value}")
 
 
-def named_levels(text: str | None, default: Sequence[str]) -> list[str]:
-    """Return the levels of --levels A,B,..
+def named_levels(text: str | None, default: Sequence[str], option: str = "--levels") -> list[str]:
+    """Return the levels A,B,.. of an option.
 
     Raises
     ------
@@ -376,5 +376,5 @@ def named_levels(text: str | None, default: Sequence[str]) -> list[str]:
         if name not in LEVELS:
             near = get_close_matches(name, LEVELS, 1)
             hint = f"did you mean {near[0]}?" if near else f"levels are {', '.join(LEVELS)}"
-            raise UsageError(f"--levels: no level {name!r}; {hint}")
+            raise UsageError(f"{option}: no level {name!r}; {hint}")
     return chosen

@@ -4,16 +4,37 @@ import math
 from pathlib import Path
 
 import click
+from click.core import ParameterSource
 
-from tsdf.cli.common import Tool, check_output, plain, write_text
+from tsdf.cli import spectral
+from tsdf.cli.common import Tool, check_numbers, check_output, plain, write_text
 from tsdf.cli.sizes import colour_of, coloured, in_words, said, sized
 
 SPECTRAL = ("tartes", "snicar", "disort", "eradiate", "phase")  # `radiative` writes them
-TARGETS = ("pbrt", "blender", "openpbr", "materialx", "arnold", "karma", "csv", "npz", *SPECTRAL)
+MEDIA = ("pbrt", "blender", "openpbr", "materialx", "arnold", "karma", "csv", "npz")  # `loaders.export` writes them
+TARGETS = (*MEDIA, *SPECTRAL)
+ONLY = {  # what some targets alone can be told
+    **dict.fromkeys(("deep_colour", "colour_thickness", "lobes", "kept", "thickness", "measure"), MEDIA),
+    **dict.fromkeys(("wavelength_nm", "settings", "table_paths", "threads", "quiet"), SPECTRAL),
+    "orders": ("disort",),
+}
+
+
+def _check_target(context: click.Context, to: str) -> None:
+    """Refuse options that do not matter to a target."""
+    for parameter in context.command.params:
+        given = context.get_parameter_source(str(parameter.name)) is ParameterSource.COMMANDLINE
+        if given and to not in ONLY.get(str(parameter.name), TARGETS):
+            raise click.UsageError(f"{parameter.opts[0]} is not for --to {to}")
 
 
 def _check_numbers(
-    words: dict[str, float], unit: float | None, kept: float, thickness: float | None, colour_thickness: float | None
+    words: dict[str, float],
+    unit: float | None,
+    kept: float,
+    thickness: float | None,
+    colour_thickness: float | None,
+    coloured: bool,
 ) -> None:
     """Refuse what no medium can have."""
     from tsdf.errors import UsageError
@@ -25,11 +46,11 @@ def _check_numbers(
         raise UsageError(f"--thickness is a number > 0, not {thickness:g}")
     if not any(word in words for word in SIZES):
         raise UsageError("say how large grains are: give one of --radius, --effective-radius, --sieve, ... (--help)")
+    if colour_thickness is not None and not coloured:
+        raise UsageError("--colour-thickness is of a colour: give --deep-colour too")
     for name, value in (("--unit", unit), ("--colour-thickness", colour_thickness)):
         if value is not None and not 0.0 < value < math.inf:
             raise UsageError(f"{name} is a finite number > 0, not {value:g}")
-    if not 1e-30 <= words.get("radius", 1.0) <= 1e30:
-        raise UsageError(f"--radius is a number of scene units from 1e-30 to 1e30, not {words['radius']:g}")
 
 
 @click.command("tsdf-export", cls=Tool)
@@ -70,11 +91,14 @@ def _check_numbers(
     "--orders", type=click.IntRange(1, 1024), default=128, show_default=True, metavar="N",
     help="Highest Legendre moment for disort.",
 )  # fmt: skip
+@spectral.building
+@click.option("--quiet", is_flag=True, help="No progress bar where tables are made.")
 @click.option("--out", metavar="PATH", help="File to write.  [default: standard output; npz and netCDF need it]")
 def main(  # noqa: PLR0913 - an argument for each option
     files: tuple[str, ...], to: str, absorption: str | None, material: str | None, deep_colour: str | None,
     colour_thickness: float | None, unit: float | None, lobes: int | None, kept: float, thickness: float | None,
-    measure: bool, wavelength_nm: str | None, orders: int, out: str | None, **options: float | None,
+    measure: bool, wavelength_nm: str | None, orders: int, settings: dict[str, str],
+    table_paths: int, threads: int | None, quiet: bool, out: str | None, **options: float | None,
 ) -> None:  # fmt: skip
     """Write the medium of grains of the table FILE for another renderer, or the table as plain arrays.
 
@@ -82,24 +106,23 @@ def main(  # noqa: PLR0913 - an argument for each option
     target is in the folder docs. For tartes, snicar, disort, eradiate and phase, FILE may be several tables of one
     grain at several indices, or a grain as of tsdf-optics; their lengths are in metres unless --unit says otherwise.
     """
+    _check_target(click.get_current_context(), to)
+    check_numbers(threads=threads, **{"table-paths": table_paths})
     if to in SPECTRAL:
         from tsdf.cli import radiative
 
-        for name, given in (("--deep-colour", deep_colour), ("--lobes", lobes), ("--thickness", thickness)):
-            if given is not None:
-                raise click.UsageError(f"{name} is not for --to {to}")
-        radiative.export(files, to, radiative.Said(absorption, material, wavelength_nm, unit, orders, out, options))
+        building = {"settings": settings, "table_paths": table_paths, "threads": threads}
+        said_so = radiative.Said(absorption, material, wavelength_nm, unit, orders, out, options, building, quiet)
+        radiative.export(files, to, said_so)
         return
     if len(files) > 1:
         raise click.UsageError(f"--to {to} takes one table, not {len(files)}")
-    if wavelength_nm is not None:
-        raise click.UsageError(f"--wavelength-nm is not for --to {to}")
     file = files[0]
     from tsdf.cli.absorption import conventions, times_radius
     from tsdf.errors import UsageError
 
     words, colour = said(options), colour_of(deep_colour)
-    _check_numbers(words, unit=unit, kept=kept, thickness=thickness, colour_thickness=colour_thickness)
+    _check_numbers(words, unit, kept, thickness, colour_thickness, bool(colour))
     if sum(given is not None for given in (absorption, material, deep_colour)) > 1:
         raise UsageError("--absorption, --material and --deep-colour all say how grains absorb: give one")
     if material is not None and unit is None:

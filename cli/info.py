@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -200,7 +201,7 @@ def describe_colour(
         seen, error = rendered(table, found * (3 // len(found)), packing, level, thick)
         facts["rendered"] = {"level": level, "colour": seen.tolist(), "standard_errors": error.tolist()}
         aim = tuple(2.0 * c - s for c, s in zip(colour, seen.tolist(), strict=False))
-        if all(0.0 < c < 1.0 for c in aim):
+        with suppress(UsageError):  # of a colour nearly out of reach, what is as far on the other side may be beyond
             facts["rendered"] |= in_conventions(absorbing(aim))
     return facts
 

@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from tsdf.cli import spectral
-from tsdf.cli.common import Tool, check_numbers, whole_number, working
+from tsdf.cli.common import Tool, check_numbers, plain, whole_number, working
 from tsdf.errors import UsageError
 
 FORWARDS = ("kept", "apart", "delta-m")
@@ -41,7 +41,7 @@ def main(
     albedo_far and g_far with diffraction (Q_ext = 2), B; each with its error, of noise and of n between tables.
     """
     asked = spectral.Asked.of(grains, said)
-    check_numbers(threads=said["threads"], paths=said["table_paths"])
+    check_numbers(threads=said["threads"], **{"table-paths": said["table_paths"]})
     if not 0 <= orders <= 1024:
         raise UsageError(f"--orders is 0 to 1024, not {orders}")
     spectral.check(asked, csv_file, plot, phase, moments)
@@ -69,16 +69,17 @@ def main(
         f"tables at n = {', '.join(f'{eta:.5g}' for eta in family.eta)}{missed}",
         *found.notes,
     ]
+    notes = [plain(note) for note in notes]
     if phase is not None:
         edges, masses = family.masses(c.n, np.nan_to_num(found.absorption_times_radius))
         with replacing(phase) as temporary:
-            temporary.write_text(phase_text(edges, masses, [f"{w:g}nm" for w in c.wavelength_nm], notes[:1]))
+            temporary.write_text(phase_text(edges, masses, spectra.wavelength_heads(c), notes[:1]), "utf-8")
     if moments is not None:
         left, straight = parted(*spectra.moments_of(family, found, orders), forward)
-        columns = {"order": np.arange(orders + 1.0)} | {f"{w:g}nm": left[i] for i, w in enumerate(c.wavelength_nm)}
+        columns = {"order": np.arange(orders + 1.0)} | dict(zip(spectra.wavelength_heads(c), left, strict=True))
         told = [notes[0], f"goes straight on ({forward}): {' '.join(f'{x:.8g}' for x in straight)}"]
         with replacing(moments) as temporary:
-            temporary.write_text(spectral.csv_text(columns, told))
+            temporary.write_text(spectral.csv_text(columns, told), "utf-8")
     if plot is not None:
         from tsdf.study import plots, spectral_plots
 

@@ -3,13 +3,13 @@
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
 from tsdf.cli import sizes, spectral
 from tsdf.cli.absorption import times_radius
-from tsdf.cli.common import check_output, working, write_text
+from tsdf.cli.common import check_output, plain, working, write_text
 from tsdf.errors import UsageError
 
 if TYPE_CHECKING:
@@ -32,6 +32,8 @@ class Said(NamedTuple):
     orders: int
     out: str | None
     options: Mapping[str, float | None]
+    building: Mapping[str, Any]  # options of `spectral.building`
+    quiet: bool
 
 
 def export(files: tuple[str, ...], to: str, said: Said) -> None:
@@ -57,35 +59,38 @@ def export(files: tuple[str, ...], to: str, said: Said) -> None:
     wavelengths = SNICAR if to == "snicar" else said.wavelength_nm or "300:2500:10"
     material = said.material or "ice"
     given = dict.fromkeys((*spectral.LENGTHS, "ssa")) | lengths | {
-        "material": material, "wavelength_nm": wavelengths, "settings": {}, "table_paths": spectral.TABLE_PATHS,
-        "threads": None,
+        "material": material, "wavelength_nm": wavelengths, **said.building,
     }  # fmt: skip
     asked = spectral.Asked.of(files, given)
+    single = to in MONOCHROME and said.material is None and said.wavelength_nm is None and asked.tabulated
+    if single:
+        if len(files) > 1:
+            raise UsageError("several tables are for a spectrum: say --material or --wavelength-nm, or give one table")
+        asked = asked._replace(material="")  # the table's own
+    elif said.absorption is not None:
+        raise UsageError("--absorption is for one table and no wavelengths; say --material instead")
     if said.out is not None:
         check_output(Path(said.out), *asked.inputs)
 
     from tsdf.loaders import radiative
     from tsdf.study import spectra
 
-    single = to in MONOCHROME and said.material is None and said.wavelength_nm is None and asked.tabulated
-    if single and len(files) > 1:
-        raise UsageError("several tables are for a spectrum: say --material or --wavelength-nm, or give one table")
-    with working(False) as work:
+    with working(said.quiet) as work:
         constants = None if single else asked.constants()
         family = asked.family(constants, work.progress)
     amounts = {name: words[name] for name in (*AMOUNTS, "material_density") if name in words}
-    if single:
-        radius = asked.words(family).radius
-        constants = _at(family, times_radius(said.absorption, words.get("radius"), said.unit)[0], radius)
-    assert constants is not None
     density = {name: amounts.pop(name) for name in ("material_density",) if name in amounts}
     grain = asked.words(family, density, **amounts)
+    if single:
+        radius = grain.radius / metres if lengths else None  # of no use where nobody said it
+        constants = _at(family, times_radius(said.absorption, radius, said.unit)[0], grain.radius)
+    assert constants is not None
     found = spectra.spectrum(family, constants, grain.radius)
     name, c = family.tables[0].header["grain"]["name"], found.constants
-    of = f"{c.material} ({c.source}), {asked.told(grain)}" if c.material else f"n {c.n[0]:.6g}, absorption " \
+    of = f"{c.material} ({c.source})" if c.material else f"n {c.n[0]:.6g}, absorption " \
         f"{found.absorption_times_radius[0]:.6g} / R"  # fmt: skip
-    notes = (f"{name}, {of}; by tsdf-export", f"tables at n = {', '.join(f'{eta:.5g}' for eta in family.eta)}",
-             *found.notes)  # fmt: skip
+    tables = f"tables at n = {', '.join(f'{eta:.5g}' for eta in family.eta)}"
+    notes = tuple(plain(note) for note in (f"{name}, {of}, {asked.told(grain)}; by tsdf-export", tables, *found.notes))
     request = radiative.Request(family, found, grain, notes, said.orders)
     if to in FILES:
         assert said.out is not None

@@ -74,6 +74,8 @@ def in_words(table: "Table", words: Mapping[str, float], unit: float | None, amo
     """Return grains of a table in everybody's words, by those that were said; the way out is told by option."""
     from tsdf.scene.sizes import AMOUNTS, convert
 
+    if not 1e-30 <= words.get("radius", 1.0) <= 1e30:
+        raise UsageError(f"--radius is a number of scene units from 1e-30 to 1e30, not {words['radius']:g}")
     if amount_needed and not any(word in words for word in AMOUNTS):
         raise UsageError("say how much of space is filled: give one of --packing, --solid-fraction, --density")
     try:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from tsdf.cli.absorption import METRES
-from tsdf.cli.common import check_output, plain, say, whole_number
+from tsdf.cli.common import check_output, say, whole_number
 from tsdf.errors import UsageError
 
 if TYPE_CHECKING:
@@ -52,6 +52,21 @@ def setting(context: click.Context, parameter: click.Parameter, values: tuple[st
     return {name: number for name, _, number in pairs}
 
 
+def building(command: Command) -> Command:
+    """Add the options that say how tables of a grain are made."""
+    for add in reversed(
+        (
+            click.option("--set", "settings", multiple=True, callback=_setting, metavar="NAME=VALUE",
+                         help="A parameter of a built-in grain; tsdf-build --grains lists them."),
+            click.option("--table-paths", callback=whole_number, default=f"{TABLE_PATHS:g}", show_default=True,
+                         metavar="N", help="Paths of each table that is made of a GRAIN."),
+            click.option("--threads", callback=whole_number, metavar="N", help="[default: all processors]"),
+        )
+    ):  # fmt: skip
+        command = add(command)
+    return command
+
+
 def options(command: Command) -> Command:
     """Add the arguments and options that say which grains, how large, of what and at which wavelengths."""
     for add in reversed(
@@ -68,11 +83,7 @@ def options(command: Command) -> Command:
             click.option("--maximum-dimension", callback=metres, metavar="LENGTH", help="Between any two points."),
             click.option("--sieve", callback=metres, metavar="LENGTH", help="Mesh width that grains just pass."),
             click.option("--ssa", type=float, metavar="X", help="Specific surface area [m2/kg]."),
-            click.option("--set", "settings", multiple=True, callback=setting, metavar="NAME=VALUE",
-                         help="A parameter of a built-in grain; tsdf-build --grains lists them."),
-            click.option("--table-paths", callback=whole_number, default=f"{TABLE_PATHS:g}", show_default=True,
-                         metavar="N", help="Paths of each table that is made of a GRAIN."),
-            click.option("--threads", callback=whole_number, metavar="N", help="[default: all processors]"),
+            building,
             click.option("--json", "as_json", is_flag=True, help="Print one JSON object."),
             click.option("--csv", "csv_file", type=click.Path(path_type=Path), metavar="PATH", help="Write columns."),
             click.option("--plot", type=click.Path(path_type=Path), metavar="PATH", help="Draw it, .png or .pdf."),
@@ -126,7 +137,7 @@ class Asked(NamedTuple):
     @property
     def inputs(self) -> list[Path]:
         """All that is read."""
-        return [Path(name) for name in (*self.grains, self.material)]
+        return [Path(name) for name in (*self.grains, self.material) if name]
 
     def constants(self) -> "Constants":
         """Return optical constants at the wavelengths.
@@ -243,6 +254,6 @@ def tell(
             temporary.write_text(csv_text(columns, notes), encoding="utf-8")
     if as_json:
         values = {name: [number(value) for value in column] for name, column in columns.items()}
-        click.echo(json.dumps({**facts, "notes": [plain(note) for note in notes], **values}))
+        click.echo(json.dumps({**facts, "notes": list(notes), **values}))
     elif not quiet:
-        say(text_table(columns, [plain(note) for note in notes]))
+        say(text_table(columns, notes))

@@ -188,8 +188,8 @@ def _command(name: str) -> Callable[[], None]:
     return run
 
 
-accuracy, albedo, build, compare, export, grains, info, merge, optics, packing, plot, preview, render, validate = map(
+(accuracy, albedo, build, compare, export, grains, info, merge, optics, packing, plot, preview, render, validate) = map(
     _command,
-    ("accuracy", "albedo", "build", "compare", "export", "grains", "info", "merge", "optics", "packing", "plot", "preview",
-     "render", "validate"),
+    ("accuracy", "albedo", "build", "compare", "export", "grains", "info", "merge", "optics", "packing", "plot",
+     "preview", "render", "validate"),
 )  # fmt: skip

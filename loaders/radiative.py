@@ -20,7 +20,7 @@ from tsdf.data.phase import parted, phase_text
 from tsdf.errors import UsageError
 from tsdf.files import replacing
 from tsdf.scene.sizes import InWords
-from tsdf.study.spectra import Family, Spectrum, moments_of
+from tsdf.study.spectra import Family, Spectrum, moments_of, wavelength_heads
 
 ICE_DENSITY = 917.0  # [kg/m^3] that TARTES takes
 BANDS_NM = 205.0 + 10.0 * np.arange(480)  # [nm] of SNICAR
@@ -142,7 +142,7 @@ def phase(request: Request) -> str:
     """Return phase functions by wavelength as text, mean over the sphere 1."""
     found = request.found
     edges, masses = request.family.masses(found.constants.n, np.nan_to_num(found.absorption_times_radius))
-    heads = [f"{w:g}nm" if w > 0.0 else "p" for w in found.constants.wavelength_nm]
+    heads = wavelength_heads(found.constants) if found.constants.material else ["p"]
     return phase_text(edges, masses, heads, request.notes)
 
 
@@ -210,16 +210,17 @@ def write_eradiate(request: Request, path: str | os.PathLike[str]) -> None:
 def _linear(edges: np.ndarray, masses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return angles' cosines (m,) and densities (w, m) linear between them, mean over the sphere 1, with the atoms.
 
-    Each cell keeps its mean: values at its ends are those of its neighbours' means, in its middle what is then left.
+    Each cell keeps its mean: values at its ends are between its neighbours' means, and at most twice either of them, in
+    its middle is what is then left. An atom is a ramp over `FORWARD_CELLS`, however many cells lie there.
     """
     inner = edges[1:-1]
     width = np.diff(inner)
     wide = width > NARROW
     low, high = inner[:-1][wide], inner[1:][wide]
     mean = 2.0 * masses[:, 1:-1][:, wide] / width[wide]
-    between = 0.5 * (mean[:, 1:] + mean[:, :-1])
+    between = np.minimum(0.5 * (mean[:, 1:] + mean[:, :-1]), 2.0 * np.minimum(mean[:, 1:], mean[:, :-1]))
     ends = np.concatenate([mean[:, :1], between, mean[:, -1:]], axis=1)
-    middle = np.maximum(2.0 * mean - 0.5 * (ends[:, 1:] + ends[:, :-1]), 0.0)
+    middle = 2.0 * mean - 0.5 * (ends[:, 1:] + ends[:, :-1])
     mu, values = [], []
     for k in range(len(low)):
         mu += [low[k], 0.5 * (low[k] + high[k])]
@@ -231,7 +232,8 @@ def _linear(edges: np.ndarray, masses: np.ndarray) -> tuple[np.ndarray, np.ndarr
         place = int(np.searchsorted(cosines, at))
         if not np.any(np.abs(cosines - at) < NARROW):
             cosines, density = np.insert(cosines, place, at), np.insert(density, place, there, axis=1)
-        density[:, -1 if side > 0.0 else 0] += 4.0 * atom / FORWARD_CELLS
+        ramp = np.maximum((side * cosines - 1.0) / FORWARD_CELLS + 1.0, 0.0)
+        density = density + 4.0 / FORWARD_CELLS * atom[:, None] * ramp
     whole = 0.5 * ((density[:, 1:] + density[:, :-1]) * np.diff(cosines)).sum(axis=1) / 2.0
     return cosines, density / np.maximum(whole, 1e-300)[:, None]
 

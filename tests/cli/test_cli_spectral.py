@@ -104,9 +104,26 @@ def test_what_both_refuse(command: object, arguments: tuple[object, ...], status
         (("--density", 900), "packing"), (("--packing", 0.9), "0.74"),
         (("--material", "quartz"), "not known at 300 nm"),
         (("--level", "teleport-joint"), "--joint 32"), (("--profile", 2000), "1 to 1000"),
+        (("--packing", 0.5, "--density", 100), "--packing and --density"),
+        (("--level", "volume,explicit"), "one level"),
+        (("--paths", 31), "at least 32 paths"), (("--packing", "nan"), "--packing"),
+        (("--density", "nan"), "--density"),
     ],
 )  # fmt: skip
 def test_what_albedo_refuses(arguments: tuple[object, ...], said: str) -> None:
     result = run(albedo, CUBE, *arguments)
     assert result.exit_code in (1, 2) and said in result.output, result.output
     assert result.output.count("\n") == 1
+
+
+def test_what_is_wrong_is_said_before_tables_are_made() -> None:
+    """Making them takes minutes."""
+    for arguments in (("--packing", 0.9), ("--ground", 2, "--thickness", "1mm"), ("--profile", -1), ("--paths", 1)):
+        result = run(albedo, "snow", "--table-paths", "1e18", *arguments)
+        assert result.exit_code == 2 and result.output.count("\n") == 1, result.output
+
+
+def test_near_wavelengths_keep_their_columns(tmp_path: Path) -> None:
+    out, near = tmp_path / "m.csv", "500.00001,500.00002"
+    assert run(optics, CUBE, "--wavelength-nm", near, "--moments", out, "--orders", 2, "--quiet").exit_code == 0
+    assert out.read_text().splitlines()[2] == "order,500.00001nm,500.00002nm"

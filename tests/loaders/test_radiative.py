@@ -124,6 +124,24 @@ def test_eradiate(cube: Table, tmp_path: Path) -> None:
     assert np.trapezoid(p[0, near], data["mu"][near]) == pytest.approx(cube.deflection_masses()[-1], abs=2e-3)
 
 
+def test_eradiate_with_fine_cells() -> None:
+    """However many cells lie within the ramp of an atom, the atom is whole and each cell keeps its mean."""
+    from tsdf.loaders.radiative import FORWARD_CELLS, _linear
+
+    theta = np.linspace(np.pi, 0.0, 257)
+    edges = np.concatenate([[-1.0, -1.0], np.cos(theta)[1:-1], [1.0, 1.0]])
+    assert np.sum(edges > 1.0 - FORWARD_CELLS) > 2  # or nothing is tried
+    masses = np.where(np.arange(258) % 3 == 0, 1.0, 1e-4) * np.diff(edges) + 1e-9  # rough, as beside rainbows
+    masses[[0, -1]] = 0.0
+    masses *= 0.66 / masses.sum()
+    masses[[0, -1]] = 0.1, 0.24
+    mu, p = _linear(edges, masses[None])
+    assert (p >= 0.0).all() and (np.diff(mu) > 0.0).all()
+    below = np.concatenate([[0.0], np.cumsum(0.25 * (p[0, 1:] + p[0, :-1]) * np.diff(mu))])
+    at = np.flatnonzero(np.abs(edges) <= 1.0 - FORWARD_CELLS)
+    assert np.interp(edges[at], mu, below) == pytest.approx(np.cumsum(masses)[at - 1], abs=1e-9)
+
+
 def test_eradiate_reads_it(tmp_path: Path) -> None:
     """Its own converter and interpolation, where it is installed."""
     pytest.importorskip("eradiate")
@@ -136,6 +154,23 @@ def test_eradiate_reads_it(tmp_path: Path) -> None:
     written("--to", "eradiate", "--effective-radius", "2e-4", "--wavelength-nm", "500,600", "--out", out)
     properties = ParticleProperties(aer_v1_to_aer_core_v2(xarray.load_dataset(out)))
     assert float(properties.eval_ssa(500.0 * ureg.nm).m[0]) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_tables_have_a_density_and_a_size_of_their_own(tmp_path: Path) -> None:
+    """Nobody who names no material means ice; any word for the size serves an absorption per length."""
+    glass, out = tmp_path / "glass.tsdf.exr", tmp_path / "g.json"
+    effort = tsdf.Effort(cells=32)
+    tsdf.write(tsdf.build("sphere", tsdf.Optics(1.5, material="glass", wavelength_nm=550.0, k=0.0), effort), glass)
+    per_kg = [
+        json.loads(written("--to", "disort", "--radius", 2e-4, *extra, file=glass))["extinction_m2_per_kg"]
+        for extra in ((), ("--material", "glass", "--wavelength-nm", "550"), ("--material-density", 917))
+    ]
+    assert per_kg == pytest.approx([0.75 / (2e-4 * 2510.0), 0.75 / (2e-4 * 2510.0), 0.75 / (2e-4 * 917.0)])
+    by = ("--to", "disort", "--unit", 1e-3, "--absorption", "0.1/mm", "--out", out)
+    assert run(*by, "--effective-radius", 2, file=glass).exit_code == 0
+    assert "absorption 0.2 / R, R 0.002 m" in json.loads(out.read_text())["notes"][0]
+    dark = json.loads(written("--to", "disort", "--absorption", "1e300/R"))
+    assert dark["omega_error"][0] < 0.01 and len(dark["notes"]) == 2  # no wavelength, so nothing about k
 
 
 def test_phase_functions_need_nothing() -> None:
@@ -156,6 +191,15 @@ def test_phase_functions_need_nothing() -> None:
         (("--to", "tartes", "--wavelength-nm", "100"), "200 to 5000 nm"),
         (("--to", "tartes", "--radius", 1e-3, "--ssa", 20), "each say how large"),
         (("--to", "disort", "--lobes", 2), "--lobes is not for"),
+        (("--to", "phase", "--kept", 0.5), "--kept is not for"), (("--to", "tartes", "--measure"), "--measure is not"),
+        (("--to", "phase", "--colour-thickness", 2), "--colour-thickness is not for"),
+        (("--to", "phase", "--orders", 2), "--orders is not for"), (("--to", "pbrt", "--quiet"), "--quiet is not for"),
+        (("--to", "pbrt", "--set", "bevel=0"), "--set is not for"),
+        (("--to", "phase", "--set", "bevel=0"), "--set shapes a GRAIN"),
+        (("--to", "phase", "--threads", 0), "--threads"),
+        (("--to", "disort", "--absorption", "1/R", "--wavelength-nm", "500"), "for one table and no wavelengths"),
+        (("--to", "pbrt", "--radius", 1, "--packing", 0.5, "--colour-thickness", 2), "give --deep-colour too"),
+        (("--to", "pbrt", "--radius", 1e40, "--packing", 0.5), "from 1e-30 to 1e30"),
         (("--to", "pbrt", "--wavelength-nm", "500"), "--wavelength-nm is not for"),
         (("--to", "tartes", "--material", "cheese"), "unknown material 'cheese'"),
     ],

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tsdf.data.phase import legendre
 from tsdf.data.table import Table
 from tsdf.errors import UsageError
 from tsdf.scene.medium import Component, volume_parameters
@@ -52,27 +53,19 @@ def deep_colour(table: Table, absorption_times_radius: float, optical_depth: flo
 
 def _moments(table: Table, x: float) -> np.ndarray:
     """Return the Legendre moments of the deflections of absorbing grains, (2 STREAMS + 2,), the first of them 1."""
-    masses, edges = table.deflection_masses(x), table.cos_theta_edges
-    count = 2 * STREAMS + 2
-    at = np.polynomial.legendre.legvander(edges, count)  # (edges, order)
-    order = np.arange(1, count)
-    integrals = (np.diff(at[:, order + 1], axis=0) - np.diff(at[:, order - 1], axis=0)) / (2 * order + 1)
-    width = np.diff(edges)
-    means = at[:-1, 1:count].copy()  # of an atom, its edge
-    wide = width > 0.0
-    means[wide] = integrals[wide] / width[wide, None]
-    return np.concatenate([[1.0], masses @ means / masses.sum()])
+    masses = table.deflection_masses(x)
+    return legendre(table.cos_theta_edges, masses / masses.sum(), 2 * STREAMS + 1)
 
 
 def _reflectance(moments: np.ndarray, w: float, depth: float) -> float:
     """Return the share of diffuse light that a layer reflects, moments (2 STREAMS,), albedo w, by doubling."""
     nodes, weights = np.polynomial.legendre.leggauss(STREAMS)
     mu, weights = 0.5 * (nodes + 1.0), 0.5 * weights
-    legendre = np.polynomial.legendre.legvander(mu, len(moments) - 1)
+    at = np.polynomial.legendre.legvander(mu, len(moments) - 1)
     order = np.arange(len(moments))
     strength = (2 * order + 1) * moments * (0.5 * w)
-    ahead = (legendre * strength) @ legendre.T * weights
-    back = (legendre * strength * (-1.0) ** order) @ legendre.T * weights
+    ahead = (at * strength) @ at.T * weights
+    back = (at * strength * (-1.0) ** order) @ at.T * weights
     eye = np.eye(STREAMS)
     loss = (eye - ahead) / mu[:, None]
     turn = back / mu[:, None]

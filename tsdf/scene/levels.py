@@ -74,3 +74,4 @@ LEVELS = {
     "volume-hg": Level(Traits(lobe=True), "#cc79a7"),
     "isotropic": Level(Traits(similar=True), "#56b4e9"),
 }
+DETAILED = tuple(name for name, level in LEVELS.items() if not level.traits.points)  # the table's own light

@@ -21,6 +21,7 @@ from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
 from tsdf.errors import TSDFError, UsageError
 from tsdf.scene import levels as L
+from tsdf.scene.levels import DETAILED as MEASURED
 from tsdf.scene.medium import MAX_PACKING_FRACTION
 from tsdf.scene.scene import LEVELS, Absorption, GrainSpec
 from tsdf.spheres.packing import MAX, pack
@@ -42,7 +43,6 @@ from tsdf.study.experiment import follow as follow
 from tsdf.study.experiment import slab as slab
 from tsdf.walk.explicit import exemplar
 
-MEASURED = ("explicit", "teleport-packed", "teleport-memory", "teleport-joint", "teleport", "volume")
 FRACTIONS = (0.1, 0.3, 0.5, 0.6, 0.64)
 LAYERS = (2.0, 4.0, 10.0, 40.0)  # [R]
 ANGLES = (0.0, 60.0)  # [degrees]

@@ -365,6 +365,17 @@ class Paths:
         return np.asarray(crossed / np.diff(LENGTHS) @ -np.diff(left, axis=0))
 
 
+def check_paths(paths: int | None) -> None:
+    """Refuse fewer paths than there are groups of them; None is not given.
+
+    Raises
+    ------
+    UsageError
+    """
+    if paths is not None and paths < GROUPS:
+        raise UsageError(f"at least {GROUPS} paths tell an error, not {paths}")
+
+
 def chosen(family: Family) -> list[int]:
     """Return the numbers of the tables at which paths are followed: at the ends and in the middle, at most."""
     last = len(family.tables) - 1
@@ -403,10 +414,12 @@ def measure(
     Raises
     ------
     UsageError
-        Where absorption is not known, and for a half-space of grains that absorb next to nothing.
+        For fewer paths than `GROUPS`, where absorption is not known, and for a half-space of grains that absorb next
+        to nothing.
     SceneError
         If the level cannot be had of these tables.
     """
+    check_paths(paths)
     x, n = found.absorption_times_radius, found.constants.n
     if np.isnan(x).any():
         where = found.constants.wavelength_nm[np.isnan(x)]

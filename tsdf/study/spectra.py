@@ -92,6 +92,11 @@ class Constants:
         return 4.0 * math.pi * self.k / (self.wavelength_nm * NM)
 
 
+def wavelength_heads(constants: Constants) -> list[str]:
+    """Return a name for each wavelength, no two alike."""
+    return [f"{w:.12g}nm" for w in constants.wavelength_nm]
+
+
 def lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Return how much the value at each node weighs in the polynomial through all, (len(at), len(nodes)) float64."""
     weights = np.ones((len(at), len(nodes)))
@@ -318,7 +323,7 @@ def spectrum(family: Family, constants: Constants, radius: float) -> Spectrum:
             "or the grain instead)"
         )
     known = ~unknown
-    if known.any():
+    if known.any() and constants.material:  # else k stands for an absorption of which nobody said a wavelength
         # what k does to reflectance: tables are made with n alone
         ignored = np.zeros(len(n))
         ignored[known] = np.abs(
