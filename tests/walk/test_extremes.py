@@ -112,7 +112,7 @@ def test_media_and_exports(name: str, tmp_path: Path, capsys: pytest.CaptureFixt
         with pytest.raises(SystemExit) as done:
             export.main([*arguments, "--out", str(tmp_path / target)])
         assert done.value.code == 0, capsys.readouterr().err
-        if target != "npz":
+        if target not in ("npz", "snicar", "eradiate"):  # these are no text
             assert not re.search(r"\b(nan|inf)\b", (tmp_path / target).read_text(), flags=re.I)
 
 
