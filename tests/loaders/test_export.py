@@ -41,7 +41,7 @@ from tsdf.scene.specs import absorption_at
 CUBE = CHECKS / "cube.tsdf.exr"
 SIGMAS = 4.0
 ORDERS = np.arange(65)
-TEXTS = [name for name in cli.TARGETS if name != "npz"]
+TEXTS = [name for name in cli.MEDIA if name != "npz"]
 NUMBER = r"[-+0-9.e]+"
 
 
