@@ -39,6 +39,9 @@ tables: .venv/installed  ## build the tables that the scenes name, into demo/
 	$(BIN)/tsdf-build ellipsoid --set subdivisions=4 --material quartz --target-error 0.02 --joint 32 --memory 64 --out demo/clear.tsdf.exr
 	$(BIN)/tsdf-validate demo/glass.tsdf.exr demo/sphere.tsdf.exr demo/snow.tsdf.exr demo/sand.tsdf.exr demo/clear.tsdf.exr
 
+library: .venv/installed  ## make the ready tables of the package and their page again, to the same bytes
+	$(BIN)/python -m tsdf.reference_data.make_library
+
 gallery: tables  ## the scenes large and the chart of errors, into gallery/; SECONDS=900 is the time for each picture
 	mkdir -p gallery
 	$(BIN)/tsdf-plot demo/snow.tsdf.exr --out gallery/snow.png
@@ -86,4 +89,4 @@ fuzz: .venv/installed  ## throw damaged and hostile files and signals at everyth
 	for name in $(FUZZERS); do \
 		$(BIN)/python fuzz/$$name.py $(if $(COUNT),--count $(COUNT)) --seed $(or $(SEED),0) || exit; done
 
-.PHONY: help install demo tables gallery pictures test test-fast check docs bench fuzz
+.PHONY: help install demo tables library gallery pictures test test-fast check docs bench fuzz

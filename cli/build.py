@@ -23,6 +23,7 @@ from tsdf.cli.common import (
 )
 from tsdf.cli.start import interrupt_status, interruptible
 from tsdf.errors import GrainError, TSDFError, UsageError
+from tsdf.make.quality import QUALITIES
 
 if TYPE_CHECKING:
     from tsdf.data.table import Table
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from tsdf.make.scatterometer import Build
     from tsdf.make.scatterometer import Progress as Done
 
+NEAR = 3.0  # times the target, an error from which on what it still takes is known to a factor of two, by trials
 LONG_S = 600.0  # [s] what takes longer deserves a note
 DEFAULT_MATERIAL, DEFAULT_WAVELENGTH_NM = "ice", 550.0
 
@@ -68,21 +70,32 @@ def _setting(context: click.Context, parameter: click.Parameter, values: tuple[s
     return settings
 
 
-def told(progress: Progress, target: float | None) -> Callable[["Done"], None]:
-    """Return what tells a progress bar of a build: paths, their rate, the error reached; and notes if it takes long."""
+def told(progress: Progress, target: float | None, quality: str | None = None) -> Callable[["Done"], None]:
+    """Return what tells a progress bar of a build: paths, their rate, the error reached; and notes if it takes long, or
+    how long it takes once its first paths have shown their pace, if a quality was asked for."""
     begun: list[float] = []
     noted: list[bool] = []
+    paced: list[float] = []  # when the first paths were done, compiling before them, and how many
 
     def tell(done: "Done") -> None:
-        begun[:] = begun or [time.monotonic(), done.paths]
-        seconds, paths = time.monotonic() - begun[0], done.paths - begun[1]
+        now = time.monotonic()
+        begun[:] = begun or [now, done.paths]
+        seconds, paths = now - begun[0], done.paths - begun[1]
+        if done.paths > begun[1]:
+            paced[:] = paced or [now, done.paths]
         words = [f"{done.paths:.3g} paths, {paths / max(seconds, 1e-9):.2g} paths/s"]
         if done.error is not None:
             goal = f" of {target:g}" if target is not None else ""
             words.append(f"total variation {done.error.total_variation:.2g}{goal}, {done.error.cells} cells")
         progress(done.paths / done.total if done.total else 0.0, ", ".join(words))
         left = seconds * (done.total - done.paths) / paths if done.total and paths else 0.0
-        if target is not None and seconds > 5.0 and left > LONG_S and not noted:
+        if quality is not None:
+            near = target is not None and done.error is not None and done.error.total_variation < NEAR * target
+            if near and done.total and paced and done.paths > paced[1] and not noted:
+                noted.append(True)
+                pace = (done.paths - paced[1]) / (now - paced[0])
+                progress.note(estimate(quality, done.total, pace, (done.total - done.paths) / pace))
+        elif target is not None and seconds > 5.0 and left > LONG_S and not noted:
             noted.append(True)
             progress.note(
                 f"--target-error {target:g} takes about {done.total:.1e} paths, {left / 60:.0f} minutes more; "
@@ -90,6 +103,15 @@ def told(progress: Progress, target: float | None) -> Callable[["Done"], None]:
             )
 
     return tell
+
+
+def estimate(quality: str, paths: float, pace: float, seconds: float) -> str:
+    """Return how long a build takes, in words."""
+    time_left = f"{seconds:.0f} s" if seconds < 100.0 else f"{seconds / 60.0:.0f} minutes"
+    return (
+        f"--quality {quality}: about {paths:.1e} paths at {pace:.1e} a second, {time_left} more, to a factor of two; "
+        "--max-seconds S ends in time, and what Ctrl-C interrupts is kept"
+    )
 
 
 @click.command("tsdf-build", cls=Tool)
@@ -125,6 +147,12 @@ def told(progress: Progress, target: float | None) -> Callable[["Done"], None]:
 @click.option("--paths", callback=whole_number, metavar="N", help="Paths to trace.  [default: 4e6]")
 @click.option("--target-error", type=float, metavar="E", help="Stop at this estimated total variation of p_theta.")
 @click.option(
+    "--quality",
+    type=click.Choice(tuple(QUALITIES)),
+    help="Target error and records in one word: draft .02, 8 joint, 32 by entry (seconds), good .005, 32, 64 (a "
+    "minute), final .0025, 64, 64 (ten). Says how long it takes first.",
+)
+@click.option(
     "--max-seconds",
     type=click.FloatRange(0.0),
     metavar="S",
@@ -136,18 +164,15 @@ def told(progress: Progress, target: float | None) -> Callable[["Done"], None]:
 @click.option(
     "--joint",
     callback=whole_number,
-    default="0",
     metavar="K",
-    show_default=True,
-    help="Joint records per cell of theta.",
+    help="Joint records per cell of theta.  [default: 0, or the quality's]",
 )
 @click.option(
     "--memory",
     callback=whole_number,
-    default="0",
     metavar="K",
-    show_default=True,
-    help="Records per cell of entry, which level teleport-memory draws from; 64 are many enough.",
+    help="Records per cell of entry, which level teleport-memory draws from; 64 are many enough.  "
+    "[default: 0, or the quality's]",
 )
 @seed_option("0")
 @click.option(
@@ -189,9 +214,10 @@ def main(  # noqa: PLR0913 - an argument for each option
     paths: int | None,
     target_error: float | None,
     max_seconds: float | None,
+    quality: str | None,
     cells: int | None,
-    joint: int,
-    memory: int,
+    joint: int | None,
+    memory: int | None,
     seed: int,
     max_bounces: int,
     threads: int | None,
@@ -211,8 +237,12 @@ def main(  # noqa: PLR0913 - an argument for each option
         (traced and grain != "sphere", "--traced is for the exact sphere; every other grain is traced anyway"),
         (exact and some, "the exact sphere takes no paths, chunks, seconds or resuming; add --traced to trace it"),
         (
-            part is not None and target_error is not None,
+            part is not None and (target_error is not None or quality is not None),
             "parts cannot know when the whole meets a target: give --paths with --chunk",
+        ),
+        (
+            quality is not None and (paths is not None or target_error is not None),
+            "--quality says how much to trace: give it, or --paths or --target-error, not both",
         ),
         ((repair or repair_any) and grain == "sphere", "--repair is for mesh files"),
     ):
@@ -222,6 +252,12 @@ def main(  # noqa: PLR0913 - an argument for each option
     from tsdf.make import scatterometer
 
     optics = optics_of(eta, material, wavelength_nm, fresnel, quiet)
+    if quality is not None:
+        chosen = QUALITIES[quality]
+        target_error = chosen.target_error
+        joint = chosen.joint if joint is None else joint
+        memory = chosen.memory if memory is None else memory
+    joint, memory = joint or 0, memory or 0
     effort = scatterometer.Effort(paths, target_error, cells, joint, seed, max_bounces, memory)
     part_file = out if part is not None else out.with_name(out.name + ".part")
     inputs = [Path(grain), *([Path(material)] if material else [])]
@@ -245,7 +281,7 @@ def main(  # noqa: PLR0913 - an argument for each option
         go_on(build, part_file, paths, max_seconds, quiet)
     try:
         table = trace(
-            build, shape, part, part_file, target_error, max_seconds, threads or os.cpu_count() or 1, quiet
+            build, shape, part, part_file, target_error, max_seconds, threads or os.cpu_count() or 1, quiet, quality
         )  # fmt: skip
     except KeyboardInterrupt:
         click.echo(
@@ -313,6 +349,7 @@ def trace(
     max_seconds: float | None,
     threads: int,
     quiet: bool,
+    quality: str | None = None,
 ) -> "Table | None":
     """Trace a grain, or one part of what is to be traced of it, and return the table, None of a part.
 
@@ -330,7 +367,7 @@ def trace(
         with interruptible(meaning, raises=True):
             with shown_progress(quiet) as progress:
                 build.run(
-                    shape, threads, part or (1, 1), part_file, None if quiet else told(progress, target_error),
+                    shape, threads, part or (1, 1), part_file, None if quiet else told(progress, target_error, quality),
                     max_seconds=math.inf if max_seconds is None else max_seconds,
                 )  # fmt: skip
             return build.table(as_it_got=max_seconds is not None) if part is None else None

@@ -45,7 +45,7 @@ def metres(context: click.Context, parameter: click.Parameter, value: str | None
     return length
 
 
-def _setting(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
+def setting(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
     pairs = [value.partition("=") for value in values]
     if any(not name or not equals for name, equals, _ in pairs) or len({name for name, _, _ in pairs}) < len(pairs):
         raise click.BadParameter("give NAME=VALUE, each name once", context, parameter)
@@ -176,7 +176,11 @@ class Asked(NamedTuple):
     @property
     def tabulated(self) -> bool:
         """Whether tables are given, and no grain."""
-        return self.grains[0].lower().endswith(SUFFIX)
+        from tsdf.data.library import names
+        from tsdf.grain.grains import BUILT_INS
+
+        name = self.grains[0]
+        return name.lower().endswith(SUFFIX) or (name in names() and name not in BUILT_INS and not Path(name).exists())
 
     def words(self, family: "Family", solid: Mapping[str, float] | None = None, **amount: float) -> "InWords":
         """Return sizes in metres, and how much of space is filled where that is said.

@@ -23,7 +23,16 @@ SAVING_S = 1.0  # [s] for a file that is being written
 LEAST_BYTES = 1280 << 20
 BYTES_PER_PROCESSOR = 160 << 20  # for the stack and the heap of each thread
 MOST_PROCESSORS = 64  # that numerical libraries start threads for
-HEAVY = ("tsdf-accuracy", "tsdf-albedo", "tsdf-build", "tsdf-compare", "tsdf-optics", "tsdf-packing", "tsdf-render")
+HEAVY = (
+    "tsdf-accuracy",
+    "tsdf-albedo",
+    "tsdf-build",
+    "tsdf-compare",
+    "tsdf-optics",
+    "tsdf-packing",
+    "tsdf-preview",
+    "tsdf-render",
+)
 
 silent = False  # standard output was closed when the process began
 _name = ""  # of the command; none before `answer`
@@ -179,8 +188,8 @@ def _command(name: str) -> Callable[[], None]:
     return run
 
 
-accuracy, albedo, build, compare, export, info, merge, optics, packing, plot, render, validate = map(
+(accuracy, albedo, build, compare, export, grains, info, merge, optics, packing, plot, preview, render, validate) = map(
     _command,
-    ("accuracy", "albedo", "build", "compare", "export", "info", "merge", "optics", "packing", "plot", "render",
-     "validate"),
+    ("accuracy", "albedo", "build", "compare", "export", "grains", "info", "merge", "optics", "packing", "plot",
+     "preview", "render", "validate"),
 )  # fmt: skip

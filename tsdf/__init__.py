@@ -14,6 +14,7 @@ True
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from tsdf.data.format import library as library
     from tsdf.data.format import read as read
     from tsdf.data.format import write as write
     from tsdf.data.sampler import Sampler as Sampler
@@ -37,6 +38,7 @@ _HOMES = {
     "TSDFError": "errors:TSDFError",
     "Table": "data.table:Table",
     "build": "make.build:build",
+    "library": "data.format:library",
     "load_grain": "grain.grains:load_grain",
     "load_scene": "scene.scene:load",
     "read": "data.format:read",
@@ -52,6 +54,7 @@ __all__ = [
     "Table",
     "__version__",
     "build",
+    "library",
     "load_grain",
     "load_scene",
     "read",

@@ -105,7 +105,7 @@ def test_progress_says_the_error_and_what_is_left(monkeypatch: pytest.MonkeyPatc
     heard: list[tuple[float, str]] = []
     noted: list[str] = []
     tell = told(Recorder(), 0.01)
-    clock = iter((0.0, 0.0, 10.0, 20.0))
+    clock = iter((0.0, 10.0, 20.0))
     monkeypatch.setattr(time, "monotonic", lambda: next(clock))
     tell(Progress())
     for paths in (1000, 2000):
@@ -114,6 +114,44 @@ def test_progress_says_the_error_and_what_is_left(monkeypatch: pytest.MonkeyPatc
     assert heard[2] == (0.002, "2e+03 paths, 1e+02 paths/s, total variation 0.03 of 0.01, 64 cells")
     (note,) = noted
     assert note.startswith("--target-error 0.01 takes about 1.0e+06 paths, 166 minutes more")
+
+
+def test_a_quality_says_how_long_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once, by the pace since the first paths, compiling left out; and not before the error says how many it takes."""
+    from tsdf.make.scatterometer import Progress
+    from tsdf.make.statistics import TableError
+
+    noted: list[str] = []
+
+    class Recorder(common.Progress):
+        def __call__(self, share: float, word: str) -> None:
+            pass
+
+        def note(self, text: str) -> None:
+            noted.append(text)
+
+    tell = told(Recorder(quiet=True), 0.01, "draft")
+    clock = iter((0.0, 60.0, 61.0, 62.0, 63.0))
+    monkeypatch.setattr(time, "monotonic", lambda: next(clock))
+    tell(Progress())
+    for paths, error in ((1000, 0.05), (2000, 0.04), (3000, 0.02), (4000, 0.02)):
+        assert not noted or paths > 3000
+        tell(Progress(paths, 33_000, 0, TableError(64, error, 0.0)))
+    (note,) = noted
+    assert note.startswith("--quality draft: about 3.3e+04 paths at 1.0e+03 a second, 30 s more, to a factor of two")
+
+
+def test_a_quality_is_a_target_and_records(tmp_path: Path) -> None:
+    """Records may be said otherwise; what else says how much to trace contradicts it, in one line."""
+    for words, joint, memory in (((), 8, 32), (("--joint", "4", "--memory", "0"), 4, 0)):
+        out = tmp_path / f"{joint}.tsdf.exr"
+        assert run("sphere", "--eta", "1.3", "--out", out, "--quality", "draft", *words).exit_code == 0
+        table = tsdf.read(out)
+        assert table.header["table_error"]["total_variation"] <= 0.02
+        assert bool(table.memory) == bool(memory) and f"--joint {joint}" in table.header["provenance"]["command"]
+    for words in (("--paths", "1e5"), ("--target-error", "0.1")):
+        assert "not both" in one_line(run("cube", "--out", tmp_path / "c.tsdf.exr", "--quality", "good", *words))
+    assert "--chunk" in one_line(run("cube", "--out", tmp_path / "c", "--quality", "good", "--chunk", "1/2"))
 
 
 @pytest.mark.slow

@@ -14,13 +14,13 @@ from tsdf.grain.optics import Optics
 from tsdf.make import scatterometer
 from tsdf.make.scatterometer import Effort
 from tsdf.picture import image, render, world
-from tsdf.scene.scene import Box, Camera, EnvironmentLight, GrainSpec, MediumSpec, Mesh, Scene, Slab
+from tsdf.scene.scene import Box, Camera, ConstantLight, EnvironmentLight, GrainSpec, MediumSpec, Mesh, Scene, Slab
 from tsdf.spheres.packing import cells_of, next_sphere, pack
 from tsdf.spheres.packing_table import law
 from tsdf.study.experiment import diffusion, slab
 from tsdf.walk import memory
 from tsdf.walk.memory import begin, memory_of, onward, remembered
-from tsdf.walk.walker import WALKER
+from tsdf.walk.walker import ENDED, FAULTS, FLY, MOST, WALKER
 
 CAMERA = Camera((0.0, 0.0, 10.0), (0.0, 0.0, 0.0), 1, 1, up=(0.0, 1.0, 0.0))
 
@@ -259,3 +259,26 @@ def test_what_cannot_be_is_said(ball: Table, above: Path) -> None:
         with pytest.raises(SceneError) as error:
             reflectance(Slab(-8.0, 0.0), fraction, (GrainSpec(table),), above, 1)
         assert words in str(error.value) and "\n" not in str(error.value)
+
+
+# ------------------------------------------------------------------------------------------------ out of bounds
+
+
+@pytest.mark.parametrize("shadow", [0, 1])
+def test_light_that_is_out_of_bounds_ends(ball: Table, tmp_path: Path, shadow: int) -> None:
+    """A walker that is outside of a mesh and believes it is inside meets no grain for ever: it is counted as lost."""
+    import trimesh
+
+    trimesh.creation.icosphere(2, radius=20.0).export(tmp_path / "ball.ply")
+    medium = MediumSpec(Mesh(tmp_path / "ball.ply"), 0.5, 1.0, (GrainSpec(ball),))
+    made = world.build(
+        Scene(Camera((0.0, -60.0, 0.0), (0.0,) * 3, 1, 1), (ConstantLight((1.0,) * 3),), (medium,)), "teleport-memory"
+    )
+    walkers = render.Walkers(made)
+    walkers.asked[MOST] = 2
+    for start, state, faults in ((0.0, None, 0), (30.0, ENDED, 1)):
+        w = np.zeros(1, WALKER)[0]
+        w["p"], w["d"], w["key"], w["shadow"], w["mode"] = (start, 0.0, 0.0), (1.0, 0.0, 0.0), 5, shadow, FLY
+        w["pdf"], w["free"], w["ray"], w["weight"] = -1.0, -1.0, -1, 1.0
+        found = memory.roam(walkers.arrays, walkers.batches[0], w, np.zeros(0), False)
+        assert (found == state or state is None) and walkers.counters[FAULTS] == faults

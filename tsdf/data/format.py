@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from tsdf.data import container
+from tsdf.data import library as library_files
 from tsdf.data.blocks import (
     BY_NAME,
     CONDITIONALS,
@@ -28,7 +29,7 @@ from tsdf.data.blocks import (
 )
 from tsdf.data.container import Broken, Format
 from tsdf.data.table import Table, thawed
-from tsdf.errors import Finding, TSDFError
+from tsdf.errors import Finding, FormatError, TSDFError
 
 # code: (severity, rule). The set is closed; SPEC.md lists it and `reference_data/golden` breaks each of them.
 CODES = container.rules("tsdf", "tsdf", "header.schema.json") | {
@@ -87,7 +88,7 @@ Breach = Callable[[str, str, Wrong, str], Broken]  # code, block, where it is br
 
 
 def read(path: str | os.PathLike[str]) -> Table:
-    """Return the table in a file.
+    """Return the table in a file, or the ready table of a name (`library.names`) that no file has.
 
     Raises
     ------
@@ -108,11 +109,32 @@ def read(path: str | os.PathLike[str]) -> Table:
     >>> round(table.mean_cosine(), 4)
     0.4737
     """
-    return container.read(path, FORMAT)
+    return container.read(library_files.found(path), FORMAT)
+
+
+def library(name: str) -> Table:
+    """Return the ready table of a name, one of those docs/library.md lists, whatever files there are.
+
+    Raises
+    ------
+    FormatError
+        There is none of that name; the message names the nearest.
+
+    Examples
+    --------
+    >>> import tsdf
+    >>> tsdf.library("sugar")
+    Table(cube, eta=1.55773, 130 cells of cos theta)
+    """
+    return container.read(library_files.ready(name) or name, FORMAT)
 
 
 def check(path: str | os.PathLike[str]) -> list[Finding]:
     """Return the broken rules of a file, as many as can be told apart."""
+    try:
+        path = library_files.found(path)
+    except FormatError as error:
+        return [Finding(error.code, "error", error.pointer, error.reason)]
     return container.inspect_file(path, FORMAT)[1]
 
 

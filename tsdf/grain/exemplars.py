@@ -2,7 +2,8 @@
 
 Units are arbitrary (`grains` normalises); vertices are shared, faces wound counter-clockwise seen from
 outside. The exact sphere is not here: it has no mesh (`grains.load_grain("sphere")`). Curved grains are
-star-shaped, a radius for every direction of a subdivided icosahedron, so they cannot cross themselves.
+star-shaped, a radius for every direction of a subdivided icosahedron, so they cannot cross themselves; crystals with
+re-entrant corners are `crystals`.
 """
 
 from collections.abc import Callable, Mapping
@@ -11,12 +12,20 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tsdf.errors import UsageError
-
-Floats = NDArray[np.float64]
-Mesh = tuple[Floats, NDArray[np.int64]]
+from tsdf.grain.crystals import (
+    Floats,
+    Mesh,
+    bullet_rosette,
+    column_aggregate,
+    droxtal,
+    hexprism,
+    hollow_column,
+    hull,
+    koch_snowflake,
+    turned,
+)
 
 
 @dataclass(frozen=True)
@@ -64,42 +73,23 @@ class Exemplar:
 # ------------------------------------------------------------------------------------------- polyhedra
 
 
-def _hull(points: Floats) -> Mesh:
-    """Return the convex hull of points that are all its corners."""
-    from scipy.spatial import ConvexHull
-
-    hull = ConvexHull(points)
-    faces = hull.simplices.astype(np.int64)
-    a, b, c = points[faces].swapaxes(0, 1)
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    faces[inward] = faces[inward, ::-1]
-    return points, faces
-
-
 def cube(bevel: float) -> Mesh:
     """Return a cube of edge 1; bevels at 45 degrees cut `bevel` off each face along each of its edges."""
     if bevel == 0:
-        return _hull(np.array(list(product((-0.5, 0.5), repeat=3))))
+        return hull(np.array(list(product((-0.5, 0.5), repeat=3))))
     signs = np.array(list(product((-1, 1), repeat=3)))
     corner = np.full((3, 3), 0.5 - bevel) + bevel * np.eye(3)
-    return _hull((signs[:, None, :] * corner).reshape(-1, 3))
+    return hull((signs[:, None, :] * corner).reshape(-1, 3))
 
 
 def octahedron() -> Mesh:
     """Return a regular octahedron of circumradius 1."""
-    return _hull(np.vstack([np.eye(3), -np.eye(3)]))
+    return hull(np.vstack([np.eye(3), -np.eye(3)]))
 
 
 def tetrahedron() -> Mesh:
     """Return a regular tetrahedron of circumradius sqrt(3)."""
-    return _hull(np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]))
-
-
-def hexprism(aspect: float) -> Mesh:
-    """Return a regular hexagonal prism of circumradius a = 1 and length L = 2 a `aspect`, axis along z."""
-    angle = np.arange(6) * np.pi / 3
-    ring = np.column_stack([np.cos(angle), np.sin(angle), np.full(6, aspect)])
-    return _hull(np.vstack([ring, ring * [1, 1, -1]]))
+    return hull(np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]))
 
 
 # ------------------------------------------------------------------------------------ star-shaped grains
@@ -239,6 +229,58 @@ def snow(lobes: int, rounding: float, seed: int, subdivisions: int) -> Mesh:
     return u * _rounded_maximum(np.array(radii), 0.06 + 0.2 * rounding)[:, None], faces
 
 
+_SIDES = np.array([[np.cos(k * np.pi / 3), np.sin(k * np.pi / 3), 0.0] for k in range(6)])  # of a hexagonal prism
+_SIMPLEX = np.array([[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]])
+
+
+@dataclass(frozen=True)
+class _Habit:
+    """How crystals that grow together look: ranges of the half-width and half-length of their prisms and of how far
+    they are set off, how near the origin a facet may come at least, and the radii of edges and of the necks between.
+    """
+
+    width: tuple[float, float]
+    length: tuple[float, float]
+    offset: tuple[float, float]
+    least: float
+    edge: float
+    neck: float
+
+    def grown(self, crystals: int, seed: int, subdivisions: int) -> Mesh:
+        """Return hexagonal prisms turned at random and united, each set off its own way but around the origin."""
+        u, faces = icosphere(subdivisions)
+        rng = np.random.default_rng(seed)
+        normals = np.vstack([_SIDES, [[0, 0, 1], [0, 0, -1]]])
+        away = _SIMPLEX[:crystals] @ turned(rng)
+        away = away - away.mean(axis=0) + rng.normal(0, 0.25, (crystals, 3))
+        radii = []
+        for way in away:
+            offset = rng.uniform(*self.offset) * way / np.linalg.norm(way) * (crystals > 1)
+            sides = rng.uniform(*self.width) * rng.uniform(0.9, 1.1, 6)
+            n = normals @ turned(rng).T
+            heights = np.maximum(np.r_[sides, np.full(2, rng.uniform(*self.length))] + n @ offset, self.least)
+            radii.append(_rounded_polytope(u, n, heights, np.full(len(u), min(self.edge, 0.95 * heights.min()))))
+        return u * _rounded_maximum(np.array(radii), self.neck)[:, None], faces
+
+
+def fresh(crystals: int, thickness: float, seed: int, subdivisions: int) -> Mesh:
+    """Return fresh snow: thin hexagonal plates grown through each other, of `thickness` over width about."""
+    habit = _Habit((0.5, 0.9), (0.5 * thickness, 0.9 * thickness), (0, 0.05), 0.4 * thickness, 0.02, 0.03)
+    return habit.grown(crystals, seed, subdivisions)
+
+
+def faceted(crystals: int, stretch: float, seed: int, subdivisions: int) -> Mesh:
+    """Return a faceted crystal: hexagonal prisms with sharp edges, one or joined, drawn out `stretch` times along z."""
+    vertices, faces = _Habit((0.5, 0.65), (0.4, 0.75), (0.1, 0.3), 0.3, 0.02, 0.03).grown(crystals, seed, subdivisions)
+    return vertices * [1, 1, stretch], faces
+
+
+def rounded(crystals: int, stretch: float, seed: int, subdivisions: int) -> Mesh:
+    """Return a rounded grain: prisms melted until little of their facets is left, drawn out `stretch` times along z."""
+    vertices, faces = _Habit((0.5, 0.65), (0.4, 0.75), (0.35, 0.6), 0.3, 0.5, 0.2).grown(crystals, seed, subdivisions)
+    return vertices * [1, 1, stretch], faces
+
+
 _SUBDIVISIONS = Parameter(5, 2, 7, "", "halvings of an icosahedron's edges; 20 * 4^n faces")
 _SEED = Parameter(0, 0, 2**32 - 1, "", "of the random shape")
 
@@ -284,6 +326,78 @@ EXEMPLARS: dict[str, Exemplar] = {
             "rounding": Parameter(0.5, 0.0, 1.0, "", "from crisp facets to melted"),
             "seed": _SEED,
             "subdivisions": _SUBDIVISIONS,
+        },
+    ),
+    "fresh": Exemplar(
+        "fresh snow: plates grown through each other, g of natural snow",
+        fresh,
+        {
+            "crystals": Parameter(2, 1, 4, "", "plates"),
+            "thickness": Parameter(0.225, 0.05, 1.0, "", "of a plate over its width"),
+            "seed": _SEED,
+            "subdivisions": _SUBDIVISIONS,
+        },
+    ),
+    "rounded": Exemplar(
+        "rounded snow grain: melted crystals, drawn out, g of natural snow",
+        rounded,
+        {
+            "crystals": Parameter(3, 1, 4, "", "crystals grown together"),
+            "stretch": Parameter(2.55, 1.0, 4.0, "", "along z"),
+            "seed": _SEED,
+            "subdivisions": _SUBDIVISIONS,
+        },
+    ),
+    "faceted": Exemplar(
+        "faceted snow crystal: irregular prism with sharp edges, drawn out, g of natural snow",
+        faceted,
+        {
+            "crystals": Parameter(1, 1, 4, "", "crystals grown together"),
+            "stretch": Parameter(2.7, 1.0, 4.0, "", "along z"),
+            "seed": _SEED,
+            "subdivisions": _SUBDIVISIONS,
+        },
+    ),
+    "droxtal": Exemplar(
+        "droxtal: ice crystal of 20 facets inscribed in a sphere",
+        droxtal,
+        {
+            "theta1": Parameter(32.35, 1.0, 44.9, "degrees", "between the axis and the corners of the basal hexagons"),
+            "theta2": Parameter(71.81, 45.1, 89.0, "degrees", "between the axis and the corners of the prism"),
+        },
+    ),
+    "bullet_rosette": Exemplar(
+        "bullet rosette: columns grown together at their pyramidal tips",
+        bullet_rosette,
+        {
+            "bullets": Parameter(6, 2, 6, "", "columns"),
+            "aspect": Parameter(2.0, 0.1, 20.0, "", "length of a column without its tip over its width across corners"),
+            "tip": Parameter(28.0, 5.0, 44.0, "degrees", "between the axis of a tip and its edges"),
+        },
+    ),
+    "column_aggregate": Exemplar(
+        "aggregate of hexagonal columns that touch",
+        column_aggregate,
+        {
+            "columns": Parameter(8, 2, 32, "", "how many"),
+            "aspect": Parameter(1.5, 0.1, 10.0, "", "mean length over width across corners"),
+            "seed": _SEED,
+        },
+    ),
+    "koch_snowflake": Exemplar(
+        "plate with the outline of Koch's snowflake",
+        koch_snowflake,
+        {
+            "order": Parameter(3, 0, 5, "", "times that triangles grow on all sides"),
+            "aspect": Parameter(0.1, 0.01, 10.0, "", "thickness over the circle's diameter around it"),
+        },
+    ),
+    "hollow_column": Exemplar(
+        "hexagonal column with pyramids sunk into both ends",
+        hollow_column,
+        {
+            "aspect": Parameter(1.5, 0.1, 100.0, "", "L/2a, length over the width across corners"),
+            "depth": Parameter(0.7, 0.0, 0.95, "of half the length", "of the pyramids"),
         },
     ),
 }

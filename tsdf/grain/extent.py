@@ -5,7 +5,6 @@ has the first two, a table's hit_probability is the third over that of the bound
 """
 
 import math
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -15,7 +14,7 @@ Floats = NDArray[np.float64]
 
 DIRECTIONS, TURNS = 300, 24  # from which the search for a sieve starts
 STARTS = 8  # of these, from which it goes on
-STEPS = 600  # of a search at most; about 100 are enough
+TOLERANCE = {"xatol": 1e-7, "fatol": 1e-9}  # where a search ends [rad, R]
 BLOCK = 1024  # vertices whose distances to all are held at once
 ALIKE = 512  # directions whose extreme vertices stand for all where a search starts
 
@@ -47,6 +46,8 @@ def sieve(vertices: Floats) -> float:
     vertices : (n, 3) float64
         Of the body.
     """
+    from scipy.optimize import minimize
+
     few = _extremes(vertices)
     angles = np.arange(TURNS) * (0.5 * math.pi / TURNS)
     first = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(TURNS)])
@@ -71,7 +72,10 @@ def sieve(vertices: Floats) -> float:
         turn, size, missed = np.zeros(3), 0.05, True
         while missed:
             across = np.ascontiguousarray(few.T)
-            turn, narrowest = _lowest(partial(hole, start=start, across=across), turn, size)
+            simplex = turn + size * np.vstack([np.zeros(3), np.eye(3)])
+            there = minimize(partial(hole, start=start, across=across), turn, method="Nelder-Mead",
+                             options={"initial_simplex": simplex, **TOLERANCE})  # fmt: skip
+            turn, narrowest = there.x, float(there.fun)
             size = 0.005
             along = vertices @ (_rotation(turn) @ start)
             width = float(np.ptp(along, axis=0).max())
@@ -82,34 +86,6 @@ def sieve(vertices: Floats) -> float:
                 )
         least = min(least, width)
     return least
-
-
-def _lowest(function: Callable[[Floats], float], start: Floats, size: float) -> tuple[Floats, float]:
-    """Return where a function of three numbers is lowest near a start, and its value there: the simplex search of
-    Nelder & Mead (1965), from a simplex of that size."""
-    corners = start + size * np.vstack([np.zeros(3), np.eye(3)])
-    values = np.array([function(corner) for corner in corners])
-    for _ in range(STEPS):
-        order = values.argsort(kind="stable")
-        corners, values = corners[order], values[order]
-        if values[-1] - values[0] <= 1e-9 and np.abs(corners[1:] - corners[0]).max() <= 1e-7:
-            break
-        middle = corners[:-1].mean(axis=0)
-        way = middle - corners[-1]
-        new = middle + way
-        value = function(new)
-        if value < values[0]:
-            if (farther := function(new + way)) < value:
-                new, value = new + way, farther
-        elif value >= values[-2]:
-            nearer = middle + (0.5 if value < values[-1] else -0.5) * way
-            if (there := function(nearer)) >= min(value, values[-1]):
-                corners[1:] = 0.5 * (corners[0] + corners[1:])
-                values[1:] = [function(corner) for corner in corners[1:]]
-                continue
-            new, value = nearer, there
-        corners[-1], values[-1] = new, value
-    return corners[0], float(values[0])
 
 
 def _frame(d: Floats) -> Floats:

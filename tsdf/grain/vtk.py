@@ -1,4 +1,4 @@
-"""VTK files: the polygons of a legacy .vtk, a .vtp or a .vtu.
+"""VTK files: the polygons of a legacy .vtk, a .vtp or a .vtu; the voxels of a legacy .vtk or a .vti.
 
 Points, polygons and triangle strips of PolyData, and the flat cells of an unstructured grid; a grid of volumes is
 refused, for its surface is another tool's to find. Text and binary, and in XML appended and compressed by zlib or lzma.
@@ -10,8 +10,9 @@ import lzma
 import re
 import warnings
 import zlib
+from collections.abc import Sequence
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -32,6 +33,9 @@ XML_TYPES = {
     "Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8",
 }
 # fmt: on
+MOST_VOXELS = 512_000_000  # of an image: 800^3
+IMAGE = "ImageData"
+SURFACE = "save it as .vtp or .stl"
 WORD = re.compile(rb"\S+")
 NO_FACE, TRIANGLE, STRIP, POLYGON, PIXEL, QUAD = (1, 2, 3, 4), 5, 6, 7, 8, 9  # cell types
 
@@ -213,7 +217,8 @@ def check_xml(data: bytes) -> None:
         raise GrainError("its XML declares a document type or is not UTF-8; save it as .stl or .ply")
 
 
-def _xml(data: bytes) -> list[Part]:
+def _xml_file(data: bytes, *kinds: str) -> "tuple[ElementTree.Element, _Arrays]":
+    """Return the root of a file whose data set is of one of these kinds, and its arrays."""
     head, mark, tail = data.partition(b"<AppendedData")
     appended = b""
     if mark:  # raw bytes are no XML: cut them out
@@ -224,9 +229,17 @@ def _xml(data: bytes) -> list[Part]:
         data = head + b"</VTKFile>"
     check_xml(data)
     root = ElementTree.fromstring(data)
-    if root.tag != "VTKFile" or root.get("type") not in ("PolyData", "UnstructuredGrid"):
-        raise GrainError(f"a data set of kind {root.get('type', root.tag)} has no surface; save it as .vtp or .stl")
-    arrays = _Arrays(root, appended, b"base64" in tag if mark else False, max(MOST_NUMBERS, len(data) + len(appended)))
+    if root.tag != "VTKFile" or root.get("type") not in kinds:
+        kind = root.get("type", root.tag)
+        if kinds == (IMAGE,):
+            raise GrainError(f"a data set of kind {kind} is no image; save voxels as ImageData (.vti)")
+        raise GrainError(f"a data set of kind {kind} has no surface; {SURFACE}")
+    most = max(MOST_VOXELS if kinds == (IMAGE,) else MOST_NUMBERS, len(data) + len(appended))
+    return root, _Arrays(root, appended, b"base64" in tag if mark else False, most)
+
+
+def _xml(data: bytes) -> list[Part]:
+    root, arrays = _xml_file(data, "PolyData", "UnstructuredGrid")
     parts: list[Part] = []
     for piece in root.iter("Piece"):
         node = piece.find("Points/DataArray")
@@ -322,3 +335,84 @@ class _Arrays:
                 raise ValueError("a compressed array whose blocks are damaged")
             at += packed
         return b"".join(found)
+
+
+# ------------------------------------------------------------------------------------------------- voxels
+
+
+class Image(NamedTuple):
+    """Voxels of an image: values (nx, ny, nz) of its first array of single numbers, and their size along x, y, z."""
+
+    values: NDArray
+    spacing: tuple[float, ...]
+
+
+def read_image(data: bytes) -> Image:
+    """Return the voxels of a legacy or XML file, at its points or in its cells.
+
+    Raises
+    ------
+    GrainError
+        Another kind of data set, more than `MOST_VOXELS` voxels, no array of single numbers.
+    Exception
+        Whatever a damaged file leads to.
+    """
+    return _legacy_image(data) if data.startswith(b"# vtk") else _xml_image(data)
+
+
+def _image(values: NDArray, points: Sequence[int], spacing: Sequence[float]) -> Image:
+    """Return the image of a number at each of so many points along x, y, z, or in each of the cells between."""
+    cells = [max(n - 1, 1) for n in points]
+    shape = points if len(values) == np.prod(points, dtype=object) else cells
+    return Image(values.reshape(tuple(shape), order="F"), tuple(map(float, spacing)))
+
+
+def _check_count(count: int) -> None:
+    if count > MOST_VOXELS:
+        raise GrainError(f"{count} voxels are more than {MOST_VOXELS}; crop it, or take every second voxel")
+
+
+def _legacy_image(data: bytes) -> Image:
+    words = _Words(data)
+    points, spacing, count = [0, 0, 0], [1.0, 1.0, 1.0], 0
+    while head := words.words():
+        key = head[0].upper()
+        if key == "DATASET" and head[1].upper() != "STRUCTURED_POINTS":
+            raise GrainError(f"a data set of kind {head[1].upper()} is no image; save voxels as STRUCTURED_POINTS")
+        if key == "DIMENSIONS":
+            points = [int(n) for n in head[1:4]]
+        elif key in ("SPACING", "ASPECT_RATIO"):
+            spacing = [float(n) for n in head[1:4]]
+        elif key in ("POINT_DATA", "CELL_DATA"):
+            _check_count(count := int(head[1]))
+        elif key == "SCALARS":
+            if head[3:] not in ([], ["1"]):
+                raise GrainError("holds vectors or colours, not one number for each voxel")
+            if words.words()[:1] != ["LOOKUP_TABLE"]:
+                raise ValueError("has no LOOKUP_TABLE after SCALARS")
+            return _image(words.array(count, LEGACY_TYPES[head[2].lower()]), points, spacing)
+        elif key == "FIELD":
+            _, width, number, kind = words.words()[:4]
+            if width != "1":
+                raise GrainError("holds vectors or colours, not one number for each voxel")
+            return _image(words.array(int(number), LEGACY_TYPES[kind.lower()]), points, spacing)
+        elif key not in ("DATASET", "ORIGIN"):
+            raise ValueError(f"{key[:20]!r} is not known")
+    raise GrainError("holds no voxels")
+
+
+def _xml_image(data: bytes) -> Image:
+    root, arrays = _xml_file(data, IMAGE)
+    image = root.find(IMAGE)
+    pieces = [] if image is None else image.findall("Piece")
+    if image is None or len(pieces) != 1:
+        raise GrainError(f"an image in {len(pieces)} pieces; save it as one")
+    ends = [int(n) for n in pieces[0].get("Extent", image.get("WholeExtent", "")).split()]
+    points = [high - low + 1 for low, high in zip(ends[::2], ends[1::2], strict=True)]
+    for section, shape in (("PointData", points), ("CellData", [max(n - 1, 1) for n in points])):
+        for node in pieces[0].iterfind(f"{section}/DataArray"):
+            if node.get("NumberOfComponents", "1") == "1":
+                _check_count(count := int(np.prod(shape, dtype=object)))
+                spacing = [float(n) for n in image.get("Spacing", "1 1 1").split()]
+                return _image(arrays.of(node, count), points, spacing)
+    raise GrainError("holds no voxels, one number for each")

@@ -20,6 +20,7 @@ from tsdf.make.tally import Tally
 from tsdf.make.tracer import Tracer, in_order
 
 PIECE = 1024  # paths that are worth a thread
+PIECES = 4  # of a round for each thread, so that one that is late holds up a quarter of its share
 THREAD_BYTES = 200_000_000  # of address space that a thread, its ray engine and its heap ask for, tallies apart
 
 
@@ -85,7 +86,7 @@ class Crew:
     def start(self, spans: Iterable[tuple[int, int]]) -> Round:
         """Begin a round of the paths numbered; of two rounds, one must be gathered before the next can start."""
         spans, side = list(spans), self._side
-        share = max(-(-sum(last - first for first, last in spans) // len(self._tracers)), PIECE)
+        share = max(-(-sum(last - first for first, last in spans) // (PIECES * len(self._tracers))), PIECE)
         pieces = [(at, min(at + share, last)) for first, last in spans for at in range(first, last, share)]
         self._side = 1 - side
         return Round({self._pool.submit(self._trace, *piece, side): piece for piece in pieces}, side)

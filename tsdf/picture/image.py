@@ -357,6 +357,16 @@ def _mend(rgb: np.ndarray, notes: list[str]) -> None:
         rgb[negative] = 0.0
 
 
+def encoded(rgb: npt.ArrayLike, exposure: float = 0.0) -> np.ndarray:
+    """Return an image as 8-bit sRGB, (h, w, 3) uint8; see `write_png`."""
+    colour = _colour()
+    if not abs(exposure) <= MAX_EXPOSURE:
+        raise UsageError(f"exposure must be -{MAX_EXPOSURE:g} to {MAX_EXPOSURE:g} stops, got {exposure}")
+    linear = _pixels(rgb, "rgb").astype(np.float64) * 2.0**exposure
+    shown: np.ndarray = colour.cctf_encoding(np.clip(np.nan_to_num(linear), 0.0, 1.0), function="sRGB")
+    return np.rint(255.0 * shown).astype(np.uint8)
+
+
 def write_png(path: str | os.PathLike[str], rgb: npt.ArrayLike, exposure: float = 0.0) -> None:
     """Write an image as 8-bit sRGB.
 
@@ -371,12 +381,7 @@ def write_png(path: str | os.PathLike[str], rgb: npt.ArrayLike, exposure: float 
     """
     import PIL.Image
 
-    colour = _colour()
-    if not abs(exposure) <= MAX_EXPOSURE:
-        raise UsageError(f"exposure must be -{MAX_EXPOSURE:g} to {MAX_EXPOSURE:g} stops, got {exposure}")
-    linear = _pixels(rgb, "rgb").astype(np.float64) * 2.0**exposure
-    encoded = colour.cctf_encoding(np.clip(np.nan_to_num(linear), 0.0, 1.0), function="sRGB")
-    picture = PIL.Image.fromarray(np.rint(255.0 * encoded).astype(np.uint8))
+    picture = PIL.Image.fromarray(encoded(rgb, exposure))
     with replacing(path) as temporary:
         picture.save(temporary, format="PNG")
 

@@ -16,13 +16,13 @@ from tsdf.scene.medium import Component, free_path
 from tsdf.scene.scene import Scene
 from tsdf.walk.geometry import MESH, Place
 from tsdf.walk.leaps import Leaps, leaps_of
+from tsdf.walk.lights import LUMINANCE, LightArrays
 from tsdf.walk.memory import Memory
 from tsdf.walk.passage import LEAST_RADIUS, Chain, Passage, kept
 from tsdf.walk.room import BALL, SLAB
 from tsdf.walk.walker import Media
 
 GAMMA = 2.0  # by default: what it leaves of an error is not seen (docs/leaps.md)
-AIMED = 6.0  # [mean free paths] left free around balls where light is aimed: from within, e^-6 of it would get out
 TOUCHED = 2.0  # [R] how far from where it is entered a sphere of level teleport-memory reaches
 LOOKED_AT = 4096  # cells of the grid that are asked for whether they are inside a mesh
 
@@ -39,6 +39,21 @@ def checked(gamma: float, name: str = "leap") -> float:
         why = "leaps that short are biased" if 0.0 < gamma < 1.0 else "0 is for no leaps"
         raise UsageError(f"{name} must be 0 or a finite number of at least 1, not {gamma:g}; {why}")
     return gamma
+
+
+def left_free(lights: LightArrays) -> float:
+    """Return how many mean free paths are left free around balls, within which nothing is aimed at lights; 0 where
+    nothing is.
+
+    From so deep, e to minus that many of the light of a leap's last grain meets lights by chance. What it finds is so
+    many times as bright as a picture as their brightest is to a white wall that faces them; with the logarithm of that,
+    chance adds some hundredths to the variance, whatever the size of a sun.
+    """
+    if not lights.sampled:
+        return 0.0
+    suns = lights.sun_radiance @ LUMINANCE
+    brightest = max(float(suns.max(initial=0.0)), float(lights.environment[..., 3].max(initial=0.0)))
+    return max(0.0, math.log(math.pi * brightest / lights.power))
 
 
 def deepest(place: Place, m: int, least: float = 0.0) -> float:
@@ -64,7 +79,7 @@ def deepest(place: Place, m: int, least: float = 0.0) -> float:
 
 def leaping(
     scene: Scene, place: Place, media: Media, tables: Tables, memory: Memory, own: Sequence[Table], gamma: float,
-    aimed: bool, progress: Callable[[float, str], None] | None = None,
+    lights: LightArrays, progress: Callable[[float, str], None] | None = None,
 ) -> tuple[Leaps, list[bool]]:  # fmt: skip
     """Return the leaps of a scene's media, and in which of them there are any.
 
@@ -76,8 +91,8 @@ def leaping(
         Of all components of all media.
     gamma : float
         Radius of the smallest leap, in transport mean free paths; 0 for none.
-    aimed : bool
-        Whether lights are aimed at.
+    lights : LightArrays
+        Those that are aimed at keep leaps away from the boundary.
     progress : callable, optional
         Called with the share done and a word about it where records must be made.
     """
@@ -96,7 +111,7 @@ def leaping(
         path = free_path(grains, medium.packing_fraction)
         unit[m] = radius if traits.spheres else mean
         touched = TOUCHED * radius if traits.remembers else float(media.reach[m])
-        margin[m] = max(touched, AIMED * mean if aimed else 0.0)
+        margin[m] = max(touched, left_free(lights) * mean)
         g = 0.0 if traits.similar else float(media.g[first])
         turn = (mean + (path.lambda_s if traits.spheres else 0.0)) / max(1.0 - g, 1e-9)
         smallest = LEAST_RADIUS * radius if traits.spheres else 0.0
@@ -111,7 +126,7 @@ def leaping(
 
         found = kept(
             Chain(media, tables, memory), m, list(zip(own[first:last], shares, strict=True)), mean / unit[m],
-            radius / unit[m], medium.packing_fraction, told,
+            radius / unit[m], told,
         )  # fmt: skip
         room[m] = gamma * unit[m] * float(found.radius[0])
         passages[m] = found

@@ -281,7 +281,7 @@ def build(
             )
     lights, said = _lights(scene)
     compiled = compile_tables(tables or [_no_table()], joint=traits.joint)
-    leaps, deep = leaping(scene, brim, media, compiled, memory, tables, gamma, bool(lights.sampled), progress)
+    leaps, deep = leaping(scene, brim, media, compiled, memory, tables, gamma, lights, progress)
     met = _grains_met(scene, traits, tables, made, parameters, limit)
     if any(deep) and limit == MAX_EVENTS:
         longest = OUTLIVED * max(n for n, there in zip(met, deep, strict=True) if there)

@@ -22,11 +22,13 @@ from typing import Any
 import numpy as np
 
 from tsdf.data import format as tsdf_format
+from tsdf.data import library
 from tsdf.data.table import Table
-from tsdf.errors import SceneError, TSDFError, UsageError
+from tsdf.errors import FormatError, SceneError, TSDFError, UsageError
 from tsdf.grain import constants
 from tsdf.grain.materials import MEDIA
 from tsdf.scene import levels
+from tsdf.scene.ball import ball_of
 from tsdf.scene.deep import absorption_of_colour, check_colour
 from tsdf.scene.keys import (
     ANY,
@@ -97,6 +99,8 @@ COLOURS = ("albedo", "deep_colour")  # two words for the colour of a deep medium
 def load(path: str | os.PathLike[str]) -> Scene:
     """Return the scene that a TOML file describes; paths in it are relative to its folder.
 
+    The name of a ready table (docs/library.md) that no file has stands for a ball of that grain in the sun.
+
     Raises
     ------
     SceneError
@@ -110,6 +114,8 @@ def load(path: str | os.PathLike[str]) -> Scene:
     (0.5, 'teleport')
     """
     name = os.fspath(path)
+    if name in library.names() and not os.path.exists(path):
+        return parse(ball_of(name), name=name)
     try:
         status = os.stat(path)
         if stat.S_ISDIR(status.st_mode):
@@ -408,8 +414,21 @@ _LIGHT = as_tagged(
         angular_diameter_deg=as_number(above=0.0, high=180.0, why="0 would make a zero-area light"),
     ),
 )
+
+
+def _table_file(value: Any, key: str, at: Place) -> Path:
+    """Read the path of a table, or the name of a ready one that no file has."""
+    if isinstance(value, str) and not os.path.exists(at.folder / value):
+        try:
+            if file := library.ready(value):
+                return file
+        except FormatError as error:
+            at.fail(error.reason)
+    return as_file(value, key, at)
+
+
 _GRAIN_KEYS: dict[str, Reader] = {
-    "table": as_file, "fraction": NOT_NEGATIVE, "mesh": as_file, "absorption": _absorption,
+    "table": _table_file, "fraction": NOT_NEGATIVE, "mesh": as_file, "absorption": _absorption,
 }  # fmt: skip
 _GRAIN = _grain(as_table(GrainSpec, **_GRAIN_KEYS), tuple(_GRAIN_KEYS))
 _MEDIUM_KEYS: dict[str, Reader] = {

@@ -20,6 +20,7 @@ from tsdf.judge import analytic
 from tsdf.judge.court import ROUNDING
 from tsdf.judge.physics import ZHOU_ETA, reference
 from tsdf.scene.levels import LEVELS
+from tsdf.study.preview import Preview
 
 SUFFIXES = (".png", ".pdf")
 DPI = 160
@@ -320,6 +321,42 @@ def _against_time(axes: Any, slabs: Sequence[Mapping[str, Any]], times: Sequence
     axes.grid(linewidth=0.3, alpha=0.5)
     axes.set_xlabel("time per event, over that of teleport")
     axes.set_ylabel("largest deviation of reflectance [%]")
+
+
+def plot_preview(found: Preview, notes: Sequence[str]) -> Any:
+    """Return a matplotlib Figure of a preview: its pictures with what to take for them, the deep colour, and notes."""
+    import textwrap
+
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(12.4, 7.3))
+        figure.suptitle(_title(found.table), fontsize=10)
+        grid = figure.subplots(2, 4)
+        figure.subplots_adjust(left=0.012, right=0.988, top=0.875, bottom=0.115, wspace=0.05, hspace=0.42)
+        for axes in grid.flat:
+            axes.set_axis_off()
+        for axes, panel in zip(grid.flat, found.panels, strict=False):
+            axes.imshow(panel.rgb, interpolation="bilinear", aspect="equal")
+            axes.set_title(panel.title)
+            bold = {"transform": axes.transAxes, "va": "top", "weight": "bold", "fontsize": 8.0}
+            axes.text(0.0, -0.03, str(panel.advice), **bold)
+            why = textwrap.wrap(panel.advice.reason, 62) + textwrap.wrap(panel.drawn, 62)
+            axes.text(0.0, -0.11, "\n".join(why), transform=axes.transAxes, va="top", fontsize=7.0)
+        swatch, words = grid[1, 2:]
+        swatch.imshow(np.broadcast_to(found.deep_srgb, (3, 4, 3)), aspect="equal")
+        swatch.set_title("deep colour")
+        swatch.set_axis_on()  # a frame, for white is the colour of what does not absorb
+        swatch.set_xticks([])
+        swatch.set_yticks([])
+        rgb = ", ".join(f"{c:.3f}" for c in found.deep)
+        swatch.text(0.0, -0.03, f"linear {rgb}", transform=swatch.transAxes, va="top", weight="bold")
+        about = "of a deep medium in white light from everywhere, whatever its packing; any level has it"
+        swatch.text(0.0, -0.11, "\n".join(textwrap.wrap(about, 62)), transform=swatch.transAxes, va="top", fontsize=7.0)
+        text = "\n".join("\n".join(textwrap.wrap(note, 52, subsequent_indent="  ")) for note in notes)
+        words.text(0.0, 1.0, text, transform=words.transAxes, va="top", fontsize=7.5, linespacing=1.4)
+    return figure
 
 
 def _title(table: Table) -> str:

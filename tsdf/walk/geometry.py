@@ -59,7 +59,7 @@ class Geometry(NamedTuple):
 # ------------------------------------------------------------------------------------------- for kernels
 
 
-@njit(**KERNEL)
+@njit(forceinline=True, **KERNEL)
 def exact_hit(kind, shape, p, d):
     """Return distance to a slab, box or ball, whether p is inside, and the outward normal there."""
     if kind == BALL:
@@ -121,7 +121,7 @@ def ball_hit(balls, p, d):
     return nearest, which
 
 
-@njit(**KERNEL)
+@njit(forceinline=True, **KERNEL)
 def clearance(g, m, p):
     """Return a length within which p of medium m is sure to have neither its boundary nor a surface around it."""
     bound = math.inf
@@ -130,7 +130,7 @@ def clearance(g, m, p):
     for b in range(g.balls.shape[0]):
         q = (p[0] - g.balls[b, 0], p[1] - g.balls[b, 1], p[2] - g.balls[b, 2])
         bound = min(bound, abs(math.sqrt(dot(q, q)) - g.balls[b, 3]))
-    return min(bound, free_around(g.grid, p))
+    return bound if g.engines == 0 else min(bound, free_around(g.grid, p))
 
 
 @njit(**KERNEL)

@@ -253,7 +253,7 @@ def _cell(sums, i, x):
     return i, (x - low) / (sums[i] - low)
 
 
-@njit(**KERNEL)
+@njit(forceinline=True, **KERNEL)
 def draw(lights, u0, u1, u2):
     """Return a direction toward environment or suns, its density and the radiance from there without the constant.
 

@@ -27,6 +27,7 @@ from tsdf.walk.walker import (
     DIM,
     ENDED,
     EVENTS,
+    FAULTS,
     LOOK,
     OTHER,
     PATIENCE,
@@ -161,7 +162,7 @@ def emerge(w, memory, n):
     w.free = memory.radius[m] * gap
 
 
-@njit(**KERNEL)
+@njit(forceinline=True, **KERNEL)
 def connect(world, batch, w, amounts, p, c, share, bound):
     """Send off light that arrives from a light and is deflected into the walker's path by a grain.
 
@@ -228,7 +229,7 @@ def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of
     radius, sampled = memory.radius[m], world.lights.sampled and not w.shadow
     first, last = media.first[m], media.first[m] + media.kinds[m] - 1
     mean, sure = media.free[m], room.whole[m] or room.kind[m] != MESH
-    luck, pdf, steps, met, state = w.luck, w.pdf, 0, 0, LOOK
+    luck, pdf, steps, met, before, state = w.luck, w.pdf, 0, 0, w.events, LOOK
     bound, fresh, spot = 0.0 if once else clearance(g, m, p), True, batch.hits.shape[0] - 1
     if free < 0.0:
         begin(w, memory)
@@ -247,6 +248,9 @@ def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of
                     break
         if steps >= PATIENCE or (sampled and not once and full(batch)):
             state = WAIT
+            if steps >= PATIENCE and met == 0 and w.events == before:  # no grain stands where it has got: out of bounds
+                batch.counters[FAULTS] += 1
+                w.weight, state = 0.0, ENDED
             break
         fresh = False
         steps += 1
@@ -280,7 +284,7 @@ def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of
             if bound < 8.0 * mean:
                 bound = max(bound, clearance(g, m, p))
             # The root of how likely the shadow is to arrive: it ends at a grain or not at all, and so costs least
-            share = min(1.0, math.exp(0.5 * (2.0 * radius - bound) / mean))
+            share = math.exp(0.5 * (2.0 * radius - bound) / mean) if 2.0 * radius < bound else 1.0
             key += GOLDEN
             if unit(mix(key)) < share:
                 write(w.d, d)

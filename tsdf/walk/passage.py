@@ -37,7 +37,7 @@ from tsdf.walk import memory as M
 from tsdf.walk.transport import deflection
 from tsdf.walk.walker import Media, halves
 
-VERSION = 1  # of records; raised whenever the same arguments give others
+VERSION = 2  # of records; raised whenever the same arguments give others
 CLASSES = 8  # of radii, each sqrt 2 of the one before
 LEAST_RADIUS = 6.0  # [R] of the first class where grains are spheres: smaller balls are of a few grains
 RECORDS = 4096  # of each class
@@ -376,6 +376,15 @@ def _corrected(tried: Sequence[np.ndarray], radius: np.ndarray, turn: float, mea
     return np.array(numbers)
 
 
+def _even(crossed: np.ndarray, records: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Return the lengths of the records that are kept, of all that were tried, at the known rates per grain met."""
+    kept = crossed[: len(records)]
+    mean = kept.mean(axis=0)
+    right = rate * records[:, GRAINS].mean(dtype=np.float64)
+    even: np.ndarray = kept * np.divide(right, mean, out=np.ones_like(mean), where=mean > 0.0)
+    return even
+
+
 def made(
     chain: Chain, m: int, mean: float, scale: float, threads: int | None = None,
     progress: Callable[[float], None] | None = None,
@@ -424,15 +433,17 @@ def made(
             done += part
             if progress is not None:
                 progress(done / total)
+    rates = [one.sum(axis=0) / other[:, GRAINS].sum() for one, other in zip(crossed, tried, strict=True)]
     numbers = _corrected(tried, radius, turn, means)
     records = np.array([one[:count] for one in tried], np.float32)
-    lengths = np.array([one[:count] / by for one, by in zip(crossed, numbers[:, 2], strict=True)], np.float32)
+    lengths = np.array([_even(*one) for one in zip(crossed, records, rates, strict=True)], np.float32)
     return Passage(means.ahead, means.aside, means.step2, turn, radius, numbers, records, lengths)
 
 
-def _digest(traits: Traits, grains: Sequence[tuple[Table, float]], *numbers: float) -> str:
+def _digest(traits: Traits, grains: Sequence[tuple[Table, float]], law: np.ndarray, *numbers: float) -> str:
     """Return what tells records from others: all that they are made of, but for the text of this package."""
     found = hashlib.sha256(repr((VERSION, RECORDS, TRIED, tuple(traits), numbers)).encode())
+    found.update(law.tobytes())
     for table, share in grains:
         found.update(json.dumps(thawed(table.header), sort_keys=True).encode())
         found.update(table.pixels.data)
@@ -441,7 +452,7 @@ def _digest(traits: Traits, grains: Sequence[tuple[Table, float]], *numbers: flo
 
 
 def kept(
-    chain: Chain, m: int, grains: Sequence[tuple[Table, float]], mean: float, scale: float, fraction: float,
+    chain: Chain, m: int, grains: Sequence[tuple[Table, float]], mean: float, scale: float,
     progress: Callable[[float], None] | None = None,
 ) -> Passage:  # fmt: skip
     """Return the records of a medium as `made` does, from the user's cache if they are there, else kept in it.
@@ -450,15 +461,13 @@ def kept(
     ----------
     grains : sequence of (Table, float)
         The medium's components and the probability that the next grain is of each.
-    fraction : float
-        Packing fraction [1]; it tells records of level teleport-memory apart.
     """
     traits, kinds = chain.media.traits, len(grains)
     g = float(chain.media.g[chain.media.first[m]]) if traits.lobe else 0.0
     if not traits.spheres:
         mean, scale = 1.0, 0.0  # the mean free path is the unit
-    digest = _digest(traits, grains if traits.spheres or traits.tabulated else (), kinds, g, mean, scale,
-                     fraction if traits.remembers else 0.0)  # fmt: skip
+    law = chain.memory.law[m, :, : chain.memory.records[m]] if traits.remembers else np.zeros(0)
+    digest = _digest(traits, grains if traits.spheres or traits.tabulated else (), law, kinds, g, mean, scale)
     path = cache_folder() / f"leaps-{digest[:32]}.npz"
     found = _read(path, digest, kinds)
     if found is None:

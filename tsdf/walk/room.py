@@ -49,7 +49,7 @@ class Room(NamedTuple):
 # ------------------------------------------------------------------------------------------- for kernels
 
 
-@njit(**KERNEL)
+@njit(forceinline=True, **KERNEL)
 def exact_depth(kind, shape, p):
     """Return the distance of p to a slab's, box's or ball's boundary, positive inside; outside a box at most that."""
     if kind == BALL:

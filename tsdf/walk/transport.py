@@ -154,7 +154,7 @@ def offset_of(media, tables, c, column, key):
 # ------------------------------------------------------------------------------------- next-event estimation
 
 
-@njit(**KERNEL)
+@njit(forceinline=True, **KERNEL)
 def connect(world, batch, w, amounts, p, c, share, bound):
     """Send off light that arrives from a light and is deflected into the walker's path by a grain.
 
@@ -209,6 +209,10 @@ def connect(world, batch, w, amounts, p, c, share, bound):
             write(shadow.p, step(p, 1.0, offset))
         else:
             aim(shadow, offset, size, toward, amount, c)
+            g, end = world.geometry, step(p, size, triple(shadow.e))
+            if bound > 0.0 and alone(g, w.medium) and clearance(g, w.medium, end) > HAIR * g.slack[w.medium]:
+                shadow.mode = FLY
+                write(shadow.p, end)
 
 
 @njit(**KERNEL)
@@ -287,8 +291,11 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
         if not once and bound <= free:
             if not fresh:
                 bound = clearance(g, m, p)
-            if bound <= free and not (convex and bound > 0.0 and clearance(g, m, step(p, free, d)) > hair):
-                sure, known = unmet(g, batch.hits[spot], m, p, d, free)
+            if bound <= free:
+                if convex:
+                    sure, known = bound > 0.0 and clearance(g, m, step(p, free, d)) > hair, False
+                else:
+                    sure, known = unmet(g, batch.hits[spot], m, p, d, free)
                 if not sure:
                     w.ray = spot if known else NONE
                     break
@@ -327,7 +334,7 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
         if sampled:
             if bound < 8.0 * mean:
                 bound = max(bound, clearance(g, m, p))
-            share = min(1.0, math.exp((reach - bound) / mean))
+            share = math.exp((reach - bound) / mean) if reach < bound else 1.0
             key += GOLDEN
             if unit(mix(key)) < share:
                 write(w.d, d)
@@ -351,8 +358,9 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
             if bound <= size and size > 0.0:
                 aim(w, offset, size, d, length, c)
                 end = step(p, size, triple(w.e))
-                sure, known = convex and bound > 0.0 and clearance(g, m, end) > hair, False
-                if not sure:
+                if convex:
+                    sure, known = bound > 0.0 and clearance(g, m, end) > hair, False
+                else:
                     sure, known = unmet(g, batch.hits[spot], m, p, triple(w.e), size)
                 if sure:
                     w.mode, p, bound = FLY, end, 0.0
@@ -385,7 +393,7 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
 # ---------------------------------------------------------------------------------------- where things are
 
 
-@njit(**KERNEL)
+@njit(forceinline=True, **KERNEL)
 def surface_met(g, p, d, hits, ray):
     """Return distance to the next opaque surface, its number, its normal against d, its thickness, and whether the ray
     engine named a facet that is behind p."""
@@ -413,7 +421,7 @@ def surface_met(g, p, d, hits, ray):
     return best, which, n, slack, spurious
 
 
-@njit(**KERNEL)
+@njit(forceinline=True, **KERNEL)
 def boundary_met(g, m, p, d, hits, ray, known):
     """Return distance to the next boundary of medium m, whether the ray is inside until then, the outward normal, the
     boundary's thickness, and whether the ray engine named a facet that is behind p. Where no facet is met, the ray is
@@ -499,7 +507,7 @@ def bounce(world, batch, w, amounts, d, met):
     return LOOK
 
 
-@njit(**KERNEL)
+@njit(forceinline=True, **KERNEL)
 def escape(world, batch, w, amounts):
     """End a walker that meets nothing more in the light that it finds."""
     if w.shadow:
@@ -619,7 +627,7 @@ def fly(world, batch, w, amounts):
     return escape(world, batch, w, amounts)
 
 
-@njit(**KERNEL)
+@njit(forceinline=True, **KERNEL)
 def pass_through(world, batch, w, amounts, t_b, t, thick):
     """Take a walker through the medium that it is in, whose boundary is at distance t_b and, if at all, a surface at t,
     that thick along the ray; return CLEAR if it comes through, else what becomes of it."""
