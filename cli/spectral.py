@@ -56,7 +56,7 @@ def building(command: Command) -> Command:
     """Add the options that say how tables of a grain are made."""
     for add in reversed(
         (
-            click.option("--set", "settings", multiple=True, callback=_setting, metavar="NAME=VALUE",
+            click.option("--set", "settings", multiple=True, callback=setting, metavar="NAME=VALUE",
                          help="A parameter of a built-in grain; tsdf-build --grains lists them."),
             click.option("--table-paths", callback=whole_number, default=f"{TABLE_PATHS:g}", show_default=True,
                          metavar="N", help="Paths of each table that is made of a GRAIN."),
