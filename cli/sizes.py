@@ -82,8 +82,13 @@ def in_words(table: "Table", words: Mapping[str, float], unit: float | None, amo
         return convert([(table, 1.0)], words, unit, amount_needed)
     except UsageError as error:
         options = ", ".join(OPTIONS[word][0] for word in words)
-        text = str(error).replace("say material_density", "say --material-density")
-        raise UsageError(f"{options}: {text.replace('packing_fraction = ', '--packing ')}") from None
+        raise UsageError(f"{options}: {by_option(error)}") from None
+
+
+def by_option(error: UsageError) -> str:
+    """Return what `scene.sizes` said, with the way out by option."""
+    text = str(error).replace("say material_density", "say --material-density")
+    return text.replace("packing_fraction = ", "--packing ")
 
 
 def colour_of(text: str | None) -> tuple[float, ...]:

@@ -14,6 +14,7 @@ import click
 
 from tsdf.cli.absorption import METRES
 from tsdf.cli.common import check_output, say, whole_number
+from tsdf.cli.sizes import by_option
 from tsdf.errors import UsageError
 
 if TYPE_CHECKING:
@@ -196,7 +197,10 @@ class Asked(NamedTuple):
         said = dict(self.sizes) | dict(solid or {}) | amount
         if self.material in DENSITIES:
             said = {MATERIAL_DENSITY: DENSITIES[self.material]} | said
-        return convert([(family.tables[0], 1.0)], said, 1.0, amount_needed=bool(amount))
+        try:
+            return convert([(family.tables[0], 1.0)], said, 1.0, amount_needed=bool(amount))
+        except UsageError as error:
+            raise UsageError(by_option(error)) from None
 
     def told(self, words: "InWords") -> str:
         """Return how large grains are, for notes."""

@@ -48,8 +48,6 @@ def _in_numbers(
     grains: Sequence[tuple[Table, float]], packing_fraction: float | None, radius: float | None, said: dict[str, Any]
 ) -> tuple[float, float]:
     """Return packing fraction and bounding radius, whatever words say them."""
-    if packing_fraction is not None and radius is not None and not said:
-        return float(packing_fraction), float(radius)
     ours = {"packing_fraction": packing_fraction, "radius": radius}
     words = {word: value for word, value in ours.items() if value is not None} | said
     metres = words.pop(LENGTH_OF_UNIT, None)
@@ -58,6 +56,8 @@ def _in_numbers(
         unit = None if metres is None else float(metres)
     except (TypeError, ValueError):
         raise UsageError(f"sizes and amounts are numbers, not {words!r}") from None
+    if set(numbers) == {"packing_fraction", "radius"}:
+        return numbers["packing_fraction"], numbers["radius"]  # `Component` and `free_path` know their ranges
     if not any(word in numbers for word in SIZES):
         raise UsageError(f"how large grains are is missing: give grain_radius, or one of {', '.join(SIZES)}")
     packed = convert(grains, numbers, unit)
@@ -116,13 +116,16 @@ class Bulk:
             grains = [Grain(grains, 1.0, absorption, *colours)]
         elif colours or np.any(np.asarray(absorption) != 0.0):
             raise UsageError("the grains of a mixture have their own absorption: Grain(table, fraction, absorption)")
-        grains = [Grain(*g) for g in grains]
+        try:
+            grains = [(g := Grain(*one))._replace(fraction=float(g.fraction)) for one in grains]
+        except (TypeError, ValueError):
+            raise UsageError(f"grains are a table, or a list of Grain(table, fraction), not {grains!r:.80}") from None
         tables = [_table(g.table) for g in grains]
         self.packing_fraction, self.radius = _in_numbers(
-            [(t, float(g.fraction)) for t, g in zip(tables, grains, strict=True)], packing_fraction, grain_radius, said
+            [(t, g.fraction) for t, g in zip(tables, grains, strict=True)], packing_fraction, grain_radius, said
         )
         self.grains = grains
-        self.components = [Component(t, float(g.fraction), self.radius) for t, g in zip(tables, grains, strict=True)]
+        self.components = [Component(t, g.fraction, self.radius) for t, g in zip(tables, grains, strict=True)]
         self.sigma_a = np.array(
             [self._absorption(g, t) for g, t in zip(grains, tables, strict=True)]
         )  # (components, 3)

@@ -160,8 +160,9 @@ def test_absorption_that_lacks_a_length():
     """The way out names what is missing."""
     fails(run(info, SPHERE, "--absorption", "1/unit"), 2, "--radius, the bounding radius")
     fails(run(info, SPHERE, "--absorption", "1/mm", "--radius", "1"), 2, "--unit, the length of that unit in metres")
-    fails(run(info, SPHERE, "--absorption", "1e300/nm", "--radius", "1e300", "--unit", "1"), 2, "out of the range")
+    fails(run(info, SPHERE, "--absorption", "1e300/nm", "--radius", "1e30", "--unit", "1"), 2, "out of the range")
     fails(run(info, SPHERE, "--absorption", "1/mm", "--radius", "0", "--unit", "1"), 2, "--radius", "> 0")
+    fails(run(info, SPHERE, "--radius", "1e200"), 2, "--radius is a number of scene units from 1e-30 to 1e30")
 
 
 def test_medium_of_packed_grains():

@@ -101,7 +101,7 @@ def test_what_both_refuse(command: object, arguments: tuple[object, ...], status
         (("--angle", 90), "below 90"), (("--angle", 30, "--diffuse"), "give one"), (("--ground", 0.5), "--thickness"),
         (("--ground", 1.5, "--thickness", "1mm"), "0 to 1"), (("--level", "telport"), "did you mean teleport"),
         (("--error", 0), "--error"), (("--depth", "1mm"), "--profile"), (("--paths", 0), "at least 1"),
-        (("--density", 900), "packing"), (("--packing", 0.9), "0.74"),
+        (("--density", 900), "Say --packing 0.64"), (("--packing", 0.9), "0.74"),
         (("--material", "quartz"), "not known at 300 nm"),
         (("--level", "teleport-joint"), "--joint 32"), (("--profile", 2000), "1 to 1000"),
         (("--packing", 0.5, "--density", 100), "--packing and --density"),

@@ -461,6 +461,12 @@ def test_values_out_of_range(make, variant, ball):
         of(ball, 0.5, 1.0, (0.1, 0.2))
     with pytest.raises(UsageError, match="absorption"):
         of(ball, 0.5, 1.0, -1.0)
+    named = [L.Grain(ball, "a")]
+    for grains, packing, radius in ((ball, "x", 1.0), (ball, 0.5, [1, 2]), (named, 0.5, 1.0), (None, 0.5, 1.0)):
+        with pytest.raises(UsageError, match=r"numbers|list of Grain"):
+            of(grains, packing, radius)
+    with pytest.raises(UsageError, match="metres_per_unit must be"):
+        of(ball, 0.5, ssa=20.0, material_density=917.0, metres_per_unit=-1.0)
 
 
 def refused(shapes: dict, match: str) -> None:

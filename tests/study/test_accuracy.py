@@ -192,7 +192,8 @@ def test_noise_of_a_profile_is_what_equal_profiles_differ_by(grain: GrainSpec) -
 
 def test_runs_beside_each_other_add_up() -> None:
     """Each keeps its mean, and what they took adds up field by field."""
-    runs = [Sums(10, np.array([m * 10.0]), np.array([(m**2 + 0.9) * 10.0]), 5, 0.25, 0, 3) for m in (1.0, 2.0)]
+    runs = [Sums(10, np.array([m * 10.0]), np.array([(m**2 + 0.9) * 10.0]), events=5, drawn=3, seconds=0.25)
+            for m in (1.0, 2.0)]  # fmt: skip
     both = accuracy._beside(runs)
     assert both.mean == pytest.approx([1.0, 2.0]) and both.error == pytest.approx(np.sqrt([0.1, 0.1]))
     assert (both.events, both.drawn, both.seconds) == (10, 6, 0.5)

@@ -52,6 +52,7 @@ def disort(depth: float, albedo: float, moments: np.ndarray, mu: float) -> tuple
         return float(solved[1](0.0)), float(sum(solved[2](depth)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("thickness", "mu"), [(math.inf, 0.5), (30.0, 1.0), (8.0, 0.6)])
 def test_discrete_ordinates(family: Family, found: Spectrum, thickness: float, mu: float) -> None:
     """Moments, albedo and extinction of this family at each wavelength, paths at three indices for all of them.

@@ -52,6 +52,7 @@ def found_tables(*etas: float) -> tuple:
     return tuple(scatterometer.exact_sphere(load_grain("sphere"), Optics(eta), Effort()) for eta in etas)
 
 
+@pytest.mark.slow
 def test_what_lies_between_is_within_the_stated_error() -> None:
     """A traced grain: tables at a few indices against one of its own, other paths, at another index. The error stated
     is no more than .001 of g, and three times the difference of neighbouring indices would be seen."""
@@ -84,6 +85,7 @@ def test_moments_between_tables_are_no_clipped_polynomials(ice: Constants, famil
     assert masses.min() >= 0.0 and masses.sum(axis=1) == pytest.approx(np.ones(len(ice.n)))
 
 
+@pytest.mark.slow
 def test_errors_grow_with_the_gap_between_tables(ice: Constants) -> None:
     """Of two tables far apart the error is large, and holds; of three it is smaller, and holds as well."""
     truth = spectra.spectrum(Family(found_tables(1.22, 1.25, 1.28, 1.31, 1.34)), ice, RADIUS)

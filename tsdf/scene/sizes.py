@@ -276,6 +276,8 @@ def _radius(sizes: GrainSizes, size: str, value: float, metres_per_unit: float |
     if size == "ssa":
         if metres_per_unit is None:
             raise UsageError("ssa is per kg and in metres: say how long the scene unit is (metres_per_unit, --unit)")
+        if not 0.0 < metres_per_unit < math.inf:
+            raise UsageError(f"metres_per_unit must be a finite number > 0, not {metres_per_unit:g}")
         return sizes.area / (sizes.volume * _known_density(sizes, size) * value * metres_per_unit)
     across = getattr(sizes, size)
     if across is None:
