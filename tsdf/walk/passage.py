@@ -369,8 +369,9 @@ def _corrected(tried: Sequence[np.ndarray], radius: np.ndarray, turn: float, mea
         depth[:count] += (out - depth)[:count].mean() - mean
         nu, far = one[:count, NU].copy(), (r - depth + out)[:count]
         by, new = 0.0, nu
-        for _ in range(4):
-            by -= (far * new + beside[:count] * np.sqrt(1.0 - new * new)).mean() / (far * (1.0 - nu * nu)).mean()
+        askew = float((far * (1.0 - nu * nu)).mean())
+        for _ in range(4 if askew > 0.0 else 0):  # grains that only turn light straight back leave nothing to mend
+            by -= (far * new + beside[:count] * np.sqrt(1.0 - new * new)).mean() / askew
             new = np.clip(nu + by * (1.0 - nu * nu), -1.0, 1.0)
         one[:count, NU] = new
     return np.array(numbers)
