@@ -17,6 +17,7 @@ from tsdf.cli.common import (
     plain,
     say,
     seed_option,
+    setting,
     shown_progress,
     threads_option,
     whole_number,
@@ -58,16 +59,6 @@ def _part(context: click.Context, parameter: click.Parameter, value: str | None)
     if slash and value.isascii() and first.isdecimal() and second.isdecimal() and 1 <= int(first) <= int(second):
         return int(first), int(second)
     raise click.BadParameter(f"{value!r} is not i/n with 1 <= i <= n", context, parameter)
-
-
-def _setting(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
-    settings = {}
-    for value in values:
-        name, equals, number = value.partition("=")
-        if not equals or not name or name in settings:
-            raise click.BadParameter(f"{value!r} is not NAME=VALUE, each name once", context, parameter)
-        settings[name] = number
-    return settings
 
 
 def told(progress: Progress, target: float | None, quality: str | None = None) -> Callable[["Done"], None]:
@@ -121,7 +112,7 @@ def estimate(quality: str, paths: float, pace: float, seconds: float) -> str:
     "--set",
     "settings",
     multiple=True,
-    callback=_setting,
+    callback=setting,
     metavar="NAME=VALUE",
     help="A parameter of a built-in grain; --grains lists them. May be given several times.",
 )

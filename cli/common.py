@@ -345,6 +345,17 @@ def seed_option(default: str) -> Callable[[F], F]:
     )  # fmt: skip
 
 
+def setting(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
+    """Read settings NAME=VALUE, each name once."""
+    settings: dict[str, str] = {}
+    for value in values:
+        name, equals, number = value.partition("=")
+        if not equals or not name or name in settings:
+            raise click.BadParameter(f"{value!r} is not NAME=VALUE, each name once", context, parameter)
+        settings[name] = number
+    return settings
+
+
 def check_numbers(seed: int | None = None, threads: int | None = None, **counts: int | None) -> None:
     """Refuse whole numbers that are out of range; None is not given.
 

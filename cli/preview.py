@@ -7,8 +7,8 @@ import click
 
 from tsdf.cli.absorption import FORM, conventions, times_radius
 from tsdf.cli.build import optics_of
-from tsdf.cli.common import Tool, check_output, plain, say, threads_option, working
-from tsdf.cli.spectral import SUFFIX, metres, setting
+from tsdf.cli.common import Tool, check_output, plain, say, setting, threads_option, working
+from tsdf.cli.spectral import SUFFIX, metres
 from tsdf.errors import UsageError
 from tsdf.make.quality import QUALITIES
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from tsdf.cli.absorption import METRES
-from tsdf.cli.common import check_output, say, whole_number
+from tsdf.cli.common import check_output, say, setting, whole_number
 from tsdf.cli.sizes import by_option
 from tsdf.errors import UsageError
 
@@ -44,13 +44,6 @@ def metres(context: click.Context, parameter: click.Parameter, value: str | None
     if not 0.0 < length < math.inf:
         raise click.BadParameter(f"{value!r} is not a length, 0.2mm say ({', '.join(METRES)})", context, parameter)
     return length
-
-
-def setting(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
-    pairs = [value.partition("=") for value in values]
-    if any(not name or not equals for name, equals, _ in pairs) or len({name for name, _, _ in pairs}) < len(pairs):
-        raise click.BadParameter("give NAME=VALUE, each name once", context, parameter)
-    return {name: number for name, _, number in pairs}
 
 
 def building(command: Command) -> Command:
