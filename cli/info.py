@@ -313,7 +313,8 @@ def _lines(facts: Mapping[str, Any]) -> Iterator[str]:
     if "medium" in facts:
         medium = facts["medium"]
         length = "R" if medium["radius"] is None else "units"
-        yield f"medium, packing fraction {medium['packing_fraction']:g}"
+        bare = ", without the colour's absorption" if "colour" in facts else ""
+        yield f"medium, packing fraction {medium['packing_fraction']:g}{bare}"
         if medium["radius"] is not None:
             yield row("radius", f"{medium['radius']:g} units")
         for name in LENGTHS:
