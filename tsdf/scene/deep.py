@@ -124,7 +124,8 @@ def check_colour(colour: Sequence[float]) -> None:
     for c in colour:
         if not 0.0 < c < 1.0:
             why = "without any absorption it is 1" if c >= 1.0 else "grains reflect some light whatever they absorb"
-            raise UsageError(f"a colour is > 0 and < 1 in each channel, not {c:g}: {why}; take a linear value such as 0.99 or 0.05")
+            way = "take a linear value such as 0.99 or 0.05"
+            raise UsageError(f"a colour is > 0 and < 1 in each channel, not {c:g}: {why}; {way}")
 
 
 def _one(table: Table, colour: float, thickness: float, packing_fraction: float) -> float:
