@@ -86,9 +86,9 @@ def texture(effort: float, folder: Path) -> None:
                 Scene(ABOVE, (EnvironmentLight(folder / "sky.exr"),), (spec,), render=Render(explicit_grains=k)), level
             )
             if w > 0.0:  # noqa: B023
-                grid = transport.Camera((0.0, 0.0, layer), (w, 0.0, 0.0), (0.0, w, 0.0), DOWN, STILL, STILL, side)  # noqa: B023
+                grid = transport.CameraArrays((0.0, 0.0, layer), (w, 0.0, 0.0), (0.0, w, 0.0), DOWN, STILL, STILL, side)  # noqa: B023
                 return render.measure(made, grid, side, side, spp, seed=seed, threads=1).rgb[..., 1].ravel()  # noqa: B023
-            rays = [transport.Camera((2.3 * i, 2.3 * j, layer), STILL, STILL, DOWN, STILL, STILL, 1)  # noqa: B023
+            rays = [transport.CameraArrays((2.3 * i, 2.3 * j, layer), STILL, STILL, DOWN, STILL, STILL, 1)  # noqa: B023
                     for i, j in itertools.product(range(side), repeat=2)]  # noqa: B023  # fmt: skip
             return np.array([
                 render.measure(made, ray, spp=spp, seed=len(rays) * seed + i, threads=1).rgb[0, 0, 1]  # noqa: B023

@@ -287,7 +287,7 @@ def test_single_grains_show(ball: Table, sky: Path) -> None:
     halves, so that noise has no part in the mean."""
     spec = MediumSpec(Slab(-10.0, 0.0), 0.6, 1.0, (GrainSpec(ball),), inside="centres", packing_spheres=FEW)
     scene, still = Scene(ABOVE, (EnvironmentLight(sky),), (spec,)), (0.0, 0.0, 0.0)
-    grid = transport.Camera((-3.0, -3.0, 20.0), (0.5, 0.0, 0.0), (0.0, 0.5, 0.0), DOWN, still, still, 12)
+    grid = transport.CameraArrays((-3.0, -3.0, 20.0), (0.5, 0.0, 0.0), (0.0, 0.5, 0.0), DOWN, still, still, 12)
 
     def half(level: str, singles: int, seed: int) -> np.ndarray:
         made = world.build(asking(scene, singles, "centres"), level)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tsdf.picture.image import spectral_weights
-from tsdf.walk.walker import Absorption, absorbed, power
+from tsdf.walk.walker import Attenuation, absorbed, power
 
 
 def test_exponentials() -> None:
@@ -25,7 +25,7 @@ def test_colour_that_is_left(amounts: tuple[float, ...]) -> None:
     rng = np.random.default_rng(0)
     weight = spectral_weights().weight
     spectral, rgb = -rng.exponential(1.0, (3, len(weight))), -rng.exponential(1.0, (3, 3))
-    absorption = Absorption(spectral, rgb, np.ascontiguousarray(weight.T), np.zeros(3))
+    absorption = Attenuation(spectral, rgb, np.ascontiguousarray(weight.T), np.zeros(3))
     found = absorbed(absorption, np.array(amounts), np.zeros(len(weight)))
     expected = (np.exp(np.array(amounts) @ spectral) @ weight) * np.exp(rgb @ amounts)
     assert np.abs(found / expected - 1.0).max() < 1e-10

@@ -15,11 +15,10 @@ from tsdf.data.table import Table
 from tsdf.picture import image
 from tsdf.scene.levels import Traits
 from tsdf.scene.medium import Component, VolumeParameters, free_path, volume_parameters
-from tsdf.scene.scene import Absorption as AbsorptionSpec
-from tsdf.scene.scene import MediumSpec, Scene
+from tsdf.scene.scene import Absorption, MediumSpec, Scene
 from tsdf.scene.specs import absorption_at
 from tsdf.walk.lights import LUMINANCE
-from tsdf.walk.walker import Absorption, Media
+from tsdf.walk.walker import Attenuation, Media
 
 DARKEST = 1e-300  # albedo, so that it has a logarithm
 FARTHEST = 1e300  # free path where nothing deflects, finite so that 0 of it is 0
@@ -51,7 +50,7 @@ class Spectra(NamedTuple):
         return float(np.array(LUMINANCE) @ by_channel)
 
 
-def spectra_of(spec: AbsorptionSpec, metres_per_unit: float | None) -> Spectra:
+def spectra_of(spec: Absorption, metres_per_unit: float | None) -> Spectra:
     """Return what a scene says of a component's absorption, by wavelength or by channel."""
     if spec.kind == "grey":
         return Spectra(None, np.full(3, spec.coefficient[0]))
@@ -78,13 +77,13 @@ class Amounts:
         self._columns.append((np.zeros(len(self.weight)) if by_wavelength is None else by_wavelength, by_channel))
         return len(self._columns) - 1
 
-    def arrays(self) -> Absorption:
+    def arrays(self) -> Attenuation:
         """Return all of them for kernels."""
         count, wavelengths = len(self._columns), len(self.weight)
         spectral = np.array([column for column, _ in self._columns]).reshape(count, wavelengths)
         rgb = np.array([column for _, column in self._columns]).T.reshape(3, count)
         least = rgb.max(axis=0) + (spectral.max(axis=1) if wavelengths else 0.0)
-        return Absorption(*map(np.ascontiguousarray, (spectral, rgb, self.weight.T, least)))
+        return Attenuation(*map(np.ascontiguousarray, (spectral, rgb, self.weight.T, least)))
 
 
 class _Row(NamedTuple):
@@ -101,7 +100,7 @@ class _Row(NamedTuple):
 
 def media_of(
     scene: Scene, traits: Traits, tables: Sequence[Table], limit: int
-) -> tuple[Media, Absorption, tuple[VolumeParameters, ...]]:
+) -> tuple[Media, Attenuation, tuple[VolumeParameters, ...]]:
     """Return media, absorption and volume parameters, with amounts only for what absorbs.
 
     Parameters

@@ -26,7 +26,7 @@ from tsdf.scene.levels import LEVELS
 from tsdf.walk import packed, transport
 from tsdf.walk import walker as W
 from tsdf.walk.hybrid import ALL
-from tsdf.walk.transport import Camera
+from tsdf.walk.transport import CameraArrays
 
 SLOTS = 2048  # walkers under way at once, per thread, but for shadows: their state stays in the second-level cache
 ROOM = 4 * SLOTS
@@ -230,7 +230,7 @@ def render(
 
 def measure(
     world: World,
-    camera: Camera,
+    camera: CameraArrays,
     width: int = 1,
     height: int = 1,
     spp: int | None = None,

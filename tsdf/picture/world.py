@@ -48,8 +48,8 @@ from tsdf.walk.hybrid import hybrid_notes, singles_of
 from tsdf.walk.leaps import Leaps
 from tsdf.walk.lights import LightArrays, compile_lights
 from tsdf.walk.memory import Memory, memory_of
-from tsdf.walk.transport import Camera
-from tsdf.walk.walker import MAX_EVENTS, Absorption, Media
+from tsdf.walk.transport import CameraArrays
+from tsdf.walk.walker import MAX_EVENTS, Attenuation, Media
 
 CAPTIVES = 32  # paths that look for a way out from the camera
 OUTLIVED = 1000.0  # of the grains met in the mean, after which a path that leaps is given up: no light lives as long
@@ -100,14 +100,14 @@ class World:
     memory: Memory
     leaps: Leaps
     lights: LightArrays
-    absorption: Absorption
+    absorption: Attenuation
     amounts: int
     parameters: tuple[VolumeParameters, ...]
     notes: tuple[str, ...]
     sizes: tuple[InWords, ...]
 
 
-def camera_of(world: World) -> Camera:
+def camera_of(world: World) -> CameraArrays:
     """Return the pinhole camera of a scene for kernels, relative to the scene's centre."""
     camera = world.scene.camera
     position = np.array(camera.position) - world.place.centre
@@ -117,7 +117,7 @@ def camera_of(world: World) -> Camera:
     pixel = 2.0 * math.tan(0.5 * math.radians(camera.fov_deg)) / camera.width
     corner = view - 0.5 * pixel * (camera.width * right + camera.height * down)
     still = (0.0, 0.0, 0.0)
-    return Camera(
+    return CameraArrays(
         _triple(position), still, still, _triple(corner), _triple(pixel * right), _triple(pixel * down), camera.width
     )
 
@@ -155,7 +155,7 @@ def sees(world: World) -> bool:
     return False
 
 
-def _shut_in(world: World, camera: Camera) -> bool:
+def _shut_in(world: World, camera: CameraArrays) -> bool:
     """Return whether paths from the camera neither leave the scene nor end, if media were clear; by following some."""
     place, g = world.place, world.place.arrays
     if not world.scene.surfaces:
@@ -198,13 +198,13 @@ def _units(v: np.ndarray) -> np.ndarray:
     return units
 
 
-def beam(world: World, origin: ArrayLike, direction: ArrayLike, width: float = 0.0) -> Camera:
+def beam(world: World, origin: ArrayLike, direction: ArrayLike, width: float = 0.0) -> CameraArrays:
     """Return a camera whose one pixel is a parallel beam, a square of given width about `origin` [unit]."""
     d = np.asarray(direction, np.float64) / np.linalg.norm(direction)
     a, b = (width * np.array(v) for v in frame(_triple(d)))
     start = np.asarray(origin, np.float64) - world.place.centre - 0.5 * (a + b)
     still = (0.0, 0.0, 0.0)
-    return Camera(_triple(start), _triple(a), _triple(b), _triple(d), still, still, 1)
+    return CameraArrays(_triple(start), _triple(a), _triple(b), _triple(d), still, still, 1)
 
 
 def _unit(v: np.ndarray) -> np.ndarray:

@@ -49,7 +49,7 @@ class Ends(NamedTuple):
     weight : (n,) float64
         What roulette makes of it; throughput but for absorption, 0 if it did not come out.
     amounts : (n, a) float64
-        Of matter crossed, see `walker.Absorption`.
+        Of matter crossed, see `walker.Attenuation`.
     events, drawn : int
         Grains met, by all; and what was drawn for that, single events and leaps.
     seconds : float
@@ -93,7 +93,7 @@ class Passed(NamedTuple):
 
 
 def trips(
-    world: World, camera: transport.Camera, first: int, paths: int, seed: int,
+    world: World, camera: transport.CameraArrays, first: int, paths: int, seed: int,
     heard: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
     aim: Callable[[np.ndarray], None] = lambda new: None,
 ) -> tuple[int, int, float]:  # fmt: skip
@@ -138,7 +138,7 @@ def trips(
 
 
 def _batch(
-    world: World, camera: transport.Camera, first: int, paths: int, seed: int, marks: int
+    world: World, camera: transport.CameraArrays, first: int, paths: int, seed: int, marks: int
 ) -> tuple[np.ndarray, Ends]:
     """Follow paths to their end, or past their limit of events so often; return as `follow` does."""
     places = np.zeros((paths, marks, 3))
@@ -161,7 +161,7 @@ def _batch(
 
 
 def follow(
-    world: World, camera: transport.Camera, paths: int, seed: int = 0, marks: int = 1, threads: int | None = None,
+    world: World, camera: transport.CameraArrays, paths: int, seed: int = 0, marks: int = 1, threads: int | None = None,
     first: int = 0,
 ) -> tuple[np.ndarray, Ends]:  # fmt: skip
     """Follow paths of a camera's first pixel to where they end; the same for any number of threads.
@@ -203,7 +203,7 @@ class Experiment:
     """Paths through a world, and the numbers (paths, q) that are read off where they were and ended."""
 
     world: World
-    camera: transport.Camera
+    camera: transport.CameraArrays
     marks: int
     read: Callable[[np.ndarray, Ends], np.ndarray]
 

@@ -292,7 +292,7 @@ class Paths:
         """Height of the slab's upper side, relative to the scene's centre."""
         return -float(self.world.place.centre[2])
 
-    def camera(self) -> transport.Camera:
+    def camera(self) -> transport.CameraArrays:
         """Return the beam, or what `_diffuse` turns into diffuse light."""
         cosine = 1.0 if self.cosine is None else self.cosine
         way = np.array([math.sqrt(1.0 - cosine**2), 0.0, -cosine])

@@ -62,7 +62,7 @@ from tsdf.walk.walker import (
     TRUNCATED,
     UNKNOWN,
     WAIT,
-    Absorption,
+    Attenuation,
     Media,
     born,
     cast,
@@ -88,10 +88,10 @@ class WorldArrays(NamedTuple):
     grains: X.Grains
     memory: M.Memory
     leaps: Leaps
-    absorption: Absorption
+    absorption: Attenuation
 
 
-class Camera(NamedTuple):
+class CameraArrays(NamedTuple):
     """Rays of a picture: along corner + x right + y down from origin + x aside + y below, x in [0, width), y in
     [0, height). A pinhole moves no origins, a parallel beam turns no directions."""
 
@@ -107,7 +107,7 @@ class Camera(NamedTuple):
 class Job(NamedTuple):
     """Samples to take: `spp` of each pixel from `pixel` on, the first of them number `sample`."""
 
-    camera: Camera
+    camera: CameraArrays
     pixel: int
     spp: int
     sample: int

@@ -69,7 +69,7 @@ class Media(NamedTuple):
     singles: int = 0
 
 
-class Absorption(NamedTuple):
+class Attenuation(NamedTuple):
     """How amounts (a,) of matter become colour: exponents per wavelength (a, k) and per channel (3, a), the weight
     (3, k) of each wavelength in linear RGB, and the exponent of the least absorbed light (a,)."""
 
