@@ -46,6 +46,10 @@ def test_a_changed_callee_is_noticed(package: Path) -> None:
     for file in package.glob("__pycache__/outer*.nbc"):
         file.write_bytes(file.read_bytes()[:-100])
     assert run(package).stdout.split()[:2] == ["3.0", "0"]  # damaged: compiled again
+    for file in package.glob("__pycache__/outer*.nbi"):
+        file.write_bytes(file.read_bytes()[:-9])
+    assert run(package).stdout.split()[:2] == ["3.0", "0"]  # so with an index that cannot be read, as after a rename
+    assert run(package).stdout.split()[:2] == ["3.0", "1"]  # and kept again
     assert run(package).stdout.split()[:2] == ["3.0", "1"]
 
 

@@ -208,5 +208,12 @@ class _Cache(caching.FunctionCache):
             return None
 
     def save_overload(self, signature: Any, data: Any) -> None:
-        with contextlib.suppress(OSError), whole:
-            super().save_overload(signature, data)
+        try:
+            with whole:
+                super().save_overload(signature, data)
+        except OSError:
+            pass
+        except Exception:  # an index that cannot be read, as of a version in which a type had another name
+            with contextlib.suppress(OSError), whole:
+                self.flush()
+                super().save_overload(signature, data)

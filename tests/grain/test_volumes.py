@@ -125,7 +125,7 @@ def test_no_stairs():
     exact = tsdf.build("sphere", 1.31, tsdf.Effort(cells=64)).mean_cosine()
     for smoothing, close in ((volumes.SMOOTHING, True), (0.5, False)):
         ((grain, _),) = volumes.solids(volumes.parts(inside), smoothing=smoothing)
-        table = tsdf.build(grain, 1.31, tsdf.Effort(paths=40_000, cells=64))
+        table = tsdf.build(grain, 1.31, tsdf.Effort(paths=80_000, cells=64))
         assert 3 * table.header["standard_errors"]["mean_cosine"] < 0.005
         assert (abs(table.mean_cosine() - exact) < 0.01) == close
 
