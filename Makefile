@@ -46,6 +46,8 @@ gallery: tables  ## the scenes large and the chart of errors, into gallery/; SEC
 	mkdir -p gallery
 	$(BIN)/tsdf-plot demo/snow.tsdf.exr --out gallery/snow.png
 	$(BIN)/tsdf-accuracy demo/sphere.tsdf.exr --out gallery/accuracy --seconds 300 --quiet
+	for name in coarse-snow fresh-snow glass-beads plates quartz salt sand sugar; do \
+		$(BIN)/tsdf-preview $$name --out gallery/$$name.png --quiet || exit; done
 	$(MAKE) --no-print-directory pictures INTO=gallery WIDTH=1280 STOP="--seconds $(or $(SECONDS),900)"
 
 pictures: .venv/installed

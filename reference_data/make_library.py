@@ -90,7 +90,8 @@ grains are taken as well (`tsdf-optics`, `tsdf-albedo`), `sand` is the grain.
 Each has 128 cells of theta, 16 joint records and 16 records by entry in each: enough for every level, too few to judge
 the levels' errors by; build your own for that. Materials are at 550 nm and do not absorb: say absorption where it is
 used. `make library` makes all again to the same bytes, and this page. Sizes are in R, the radius of the bounding
-sphere: a crystal of sugar 1 mm from corner to corner has R = 0.5 mm. [Words](glossary.md), [sizes](sizes.md).
+sphere: a crystal of sugar 1 mm from corner to corner has R = 0.5 mm. `tsdf-preview sugar` shows what
+a table looks like, `make gallery` all of them. [Words](glossary.md), [sizes](sizes.md).
 
 | name | grain | n | g, geometrical | B | dark share | hit probability | effective radius [R] | kB |
 |---|---|---|---|---|---|---|---|---|
