@@ -8,7 +8,7 @@ import click
 from tsdf.cli.absorption import FORM, conventions, times_radius
 from tsdf.cli.build import optics_of
 from tsdf.cli.common import Tool, check_output, plain, say, setting, threads_option, working
-from tsdf.cli.spectral import SUFFIX, metres
+from tsdf.cli.spectral import is_table, metres
 from tsdf.errors import UsageError
 from tsdf.make.quality import QUALITIES
 
@@ -65,7 +65,7 @@ def main(
 
     check_numbers(threads=threads)
     check_suffix(out)
-    tabulated = grain.lower().endswith(SUFFIX)
+    tabulated = is_table(grain)
     if tabulated and (settings or eta is not None):
         raise UsageError("--set and --eta are of a GRAIN that is built, not of a table")
     if material is not None and absorption is not None:

@@ -88,6 +88,14 @@ def options(command: Command) -> Command:
     return command
 
 
+def is_table(name: str) -> bool:
+    """Whether a name stands for a table, by its ending or as a ready one's, and not for a grain."""
+    from tsdf.data.library import names
+    from tsdf.grain.grains import BUILT_INS
+
+    return name.lower().endswith(SUFFIX) or (name in names() and name not in BUILT_INS and not Path(name).exists())
+
+
 class Asked(NamedTuple):
     """Options of `options`, but for those about output."""
 
@@ -170,11 +178,7 @@ class Asked(NamedTuple):
     @property
     def tabulated(self) -> bool:
         """Whether tables are given, and no grain."""
-        from tsdf.data.library import names
-        from tsdf.grain.grains import BUILT_INS
-
-        name = self.grains[0]
-        return name.lower().endswith(SUFFIX) or (name in names() and name not in BUILT_INS and not Path(name).exists())
+        return is_table(self.grains[0])
 
     def words(self, family: "Family", solid: Mapping[str, float] | None = None, **amount: float) -> "InWords":
         """Return sizes in metres, and how much of space is filled where that is said.

@@ -7,6 +7,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from tsdf.cli.preview import main
+from tsdf.cli.spectral import is_table
 from tsdf.reference_data.make_checks import CHECKS
 
 CUBE = CHECKS / "cube_memory.tsdf.exr"
@@ -55,3 +56,10 @@ def test_refused_in_one_line(
     assert result.exit_code in (1, 2) and said in result.stderr
     assert result.stderr.startswith("tsdf-preview: error: ") and result.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_ready_table_by_name() -> None:
+    """It is taken for a table, unlike a built-in grain and what is neither; what is of grains alone is refused."""
+    assert is_table("sugar") and is_table("x.tsdf.exr") and not is_table("sand") and not is_table("sugra")
+    result = run("sugar", "--eta", 1.5)
+    assert result.exit_code == 2 and "not of a table" in result.stderr
