@@ -9,7 +9,7 @@ neighbours are as well), teleport-packed (packed grains, answered by records), e
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import assert_never
 
 import numpy as np
@@ -23,6 +23,7 @@ from tsdf.grain.grains import first_hit, load_grain
 from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.picture import image
+from tsdf.picture.footprint import met_by_pixel
 from tsdf.picture.leaping import GAMMA, checked, leaping
 from tsdf.picture.media import DARKEST, media_of, spectra_of
 from tsdf.scene.levels import LEVELS, Traits
@@ -44,11 +45,11 @@ from tsdf.spheres.packing_table import law
 from tsdf.vectors import frame
 from tsdf.walk.explicit import Packed, nothing_packed, packed
 from tsdf.walk.geometry import MESH, Place, Triangles, ball_hit, exact_hit, place
-from tsdf.walk.hybrid import hybrid_notes, singles_of
+from tsdf.walk.hybrid import ALL, hybrid_notes, singles_of
 from tsdf.walk.leaps import Leaps
 from tsdf.walk.lights import LightArrays, compile_lights
 from tsdf.walk.memory import Memory, memory_of
-from tsdf.walk.transport import CameraArrays
+from tsdf.walk.transport import NOBODY, CameraArrays
 from tsdf.walk.walker import MAX_EVENTS, Attenuation, Media
 
 CAPTIVES = 32  # paths that look for a way out from the camera
@@ -87,6 +88,8 @@ class World:
         What the user should know, one line each.
     sizes : tuple of InWords
         Of the media, in everybody's words.
+    met : (h * w,) int64
+        Of its explicit grains, how many a pixel counts as met before it begins; () where all have as many.
     """
 
     scene: Scene
@@ -105,6 +108,7 @@ class World:
     parameters: tuple[VolumeParameters, ...]
     notes: tuple[str, ...]
     sizes: tuple[InWords, ...]
+    met: np.ndarray = field(default_factory=lambda: NOBODY)
 
 
 def camera_of(world: World) -> CameraArrays:
@@ -299,7 +303,7 @@ def build(
     grains = nothing_packed(len(scene.media), len(tables))
     if singles and scene.media:
         grains = packed(scene, tables, traced=not traits.answered)
-    return World(
+    ready = World(
         scene=scene,
         level=level,
         leap=gamma if any(deep) else 0.0,
@@ -317,6 +321,9 @@ def build(
         notes=(*notes, *grains.notes),
         sizes=tuple(_sizes(scene, tables)),
     )
+    if scene.render.fewer_far and 0 < singles < ALL:
+        ready.met = met_by_pixel(scene, made, camera_of(ready), singles)
+    return ready
 
 
 def _sizes(scene: Scene, tables: list[Table]) -> Iterator[InWords]:

@@ -40,6 +40,7 @@ from tsdf.scene.keys import (
     as_choice,
     as_colour,
     as_file,
+    as_flag,
     as_integer,
     as_name,
     as_number,
@@ -489,6 +490,7 @@ _SCENE = as_table(
             seed=as_integer(),
             leap=_leap,
             explicit_grains=as_integer(0, MAX_EXPLICIT),
+            fewer_far=as_flag,
         )
     ),
     light=as_tables("[[light]]", _LIGHT, MAX_LIGHTS),

@@ -45,6 +45,7 @@ class Render:
     seed: int = 0
     leap: float | None = None  # smallest leap [transport mean free paths], 0 for none; None where it is not said
     explicit_grains: int = 0  # met one by one, the first from the camera, before a chain of grains takes over
+    fewer_far: bool = False  # so many only where grains look largest, fewer where a pixel covers more of them
 
 
 @dataclass(frozen=True)
