@@ -30,6 +30,7 @@ HEAVY = (
     "tsdf-compare",
     "tsdf-optics",
     "tsdf-packing",
+    "tsdf-plan",
     "tsdf-preview",
     "tsdf-render",
 )
@@ -188,8 +189,9 @@ def _command(name: str) -> Callable[[], None]:
     return run
 
 
-(accuracy, albedo, build, compare, export, grains, info, merge, optics, packing, plot, preview, render, validate) = map(
+(accuracy, albedo, build, compare, export, grains, info, merge, optics, packing, plan, plot, preview, render,
+ validate) = map(
     _command,
-    ("accuracy", "albedo", "build", "compare", "export", "grains", "info", "merge", "optics", "packing", "plot",
+    ("accuracy", "albedo", "build", "compare", "export", "grains", "info", "merge", "optics", "packing", "plan", "plot",
      "preview", "render", "validate"),
 )  # fmt: skip

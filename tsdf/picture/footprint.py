@@ -73,7 +73,7 @@ def footprints(scene: Scene, place: Place, camera: CameraArrays) -> np.ndarray:
 def met_by_pixel(scene: Scene, place: Place, camera: CameraArrays, grains: int) -> np.ndarray:
     """Return how many of `grains` explicit ones each pixel counts as met before it begins, (h * w,) int64.
 
-    None where a pixel covers least of the grains, all where it sees none; in between as many as leave it the same error.
+    None where a pixel covers least of the grains, all where it sees none; in between as many as leave the same error.
     """
     seen = footprints(scene, place, camera)
     rows, columns = np.pad(seen, 1, constant_values=math.inf), seen.shape

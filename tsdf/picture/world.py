@@ -26,7 +26,7 @@ from tsdf.picture import image
 from tsdf.picture.footprint import met_by_pixel
 from tsdf.picture.leaping import GAMMA, checked, leaping
 from tsdf.picture.media import DARKEST, media_of, spectra_of
-from tsdf.scene.levels import LEVELS, Traits
+from tsdf.scene.levels import AUTO, LEVELS, Traits
 from tsdf.scene.medium import Component, VolumeParameters, free_path
 from tsdf.scene.scene import (
     Box,
@@ -224,7 +224,7 @@ def _triple(v: np.ndarray) -> tuple[float, float, float]:
 
 def build(
     scene: Scene, level: str, limit: int = MAX_EVENTS, leap: float | None = None,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Callable[[float, str], None] | None = None, places: dict[bool, Place] | None = None,
 ) -> World:  # fmt: skip
     """Return a scene ready to be rendered at a level.
 
@@ -239,6 +239,8 @@ def build(
         where the level leaps at all.
     progress : callable, optional
         Called with the share done and a word about it while records for leaps are made.
+    places : dict, optional
+        Geometry of the same scene, as far as it has been made, with and without single grains; it is added to.
 
     Raises
     ------
@@ -246,7 +248,8 @@ def build(
         In one line, for whatever makes the scene impossible at that level.
     """
     if level not in LEVELS:
-        raise SceneError(f"{scene.name}: no level {level!r}; levels are {', '.join(LEVELS)}")
+        hint = "; tsdf-plan chooses one" if level == AUTO else ""
+        raise SceneError(f"{scene.name}: no level {level!r}; levels are {', '.join(LEVELS)}{hint}")
     traits, singles = LEVELS[level].traits, singles_of(scene, level)
     gamma = _gamma(scene, level, leap)
     read: dict[str, Table] = {}
@@ -260,9 +263,16 @@ def build(
         return read[file]
 
     tables = [table_of(grain) for medium in scene.media for grain in medium.grains]
-    made = brim = place(scene, grains=traits.placed or singles > 0)
+    places = {} if places is None else places
+
+    def placed(grains: bool) -> Place:
+        if grains not in places:
+            places[grains] = place(scene, grains=grains)
+        return places[grains]
+
+    made = brim = placed(traits.placed or singles > 0)
     if not traits.placed and singles and any(medium.inside == "centres" for medium in scene.media):
-        brim = place(scene)
+        brim = placed(False)
     notes = list(made.notes)
     media, absorption, parameters = media_of(scene, traits, tables, limit)
     if records := LEVELS[level].records:

@@ -110,8 +110,8 @@ NOBODY = np.zeros(0, np.int64)
 
 
 class Job(NamedTuple):
-    """Samples to take: `spp` of each pixel from `pixel` on, the first of them number `sample`. Those of each pixel begin
-    as if they had met `met` single grains, by pixel, none where it is empty."""
+    """Samples to take: `spp` of each pixel from `pixel` on, the first of them number `sample`. Those of each pixel
+    begin as if they had met `met` single grains, by pixel, none where it is empty."""
 
     camera: CameraArrays
     pixel: int
