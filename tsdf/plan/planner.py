@@ -285,6 +285,12 @@ class _Planning:
                 f"processors are busy with other things: now everything takes {self.load:.1f} times as long"
             )
 
+        if self.reference is not None and not self.trusted(self.pilots[self.reference]):
+            self.notes.append(
+                "single grains meet suns and small bright lights by chance alone, too seldom for pilots: errors are what "
+                "is expected of slabs, and levels that aim at lights are the safer choice"
+            )
+
     def finalists(self) -> list[Candidate]:
         """Return the candidates that may be the best, of which pilots are worth their time."""
         found = self.predictions()
@@ -362,17 +368,22 @@ class _Planning:
         return bias, bias_error, beliefs.of_square(size, spread, square, error), one.known or apart is not None
 
     def missed(self, plain: Candidate) -> tuple[float, float] | None:
-        """Return the texture that all levels without single grains miss alike, by the pilot that knows it best, and
-        the spread of its logarithm; None for levels that have some of it, for that pilot, and where there is none."""
+        """Return the texture that all levels without single grains miss alike, by the one that is believed to have the
+        least error, and the spread of its logarithm; None for that, and for levels that have some of it."""
         alike = [c for c in self.pilots if not c.explicit_grains and not LEVELS[c.level].traits.packed]
         seen = {c: apart for c in alike if (apart := self.apart(c)) is not None}
         if not seen or LEVELS[plain.level].traits.packed:
             return None
-        best = min(seen, key=lambda c: seen[c].square_error)
+        floors = {
+            c: beliefs.of_square(
+                self.expected[c.level].floor, max(self.expected[c.level].spread, 1e-9), a.square, a.square_error
+            )
+            for c, a in seen.items()
+        }
+        best = min(floors, key=lambda c: floors[c].value)
         if best == plain:
             return None
-        one = self.expected[best.level]
-        floor = beliefs.of_square(one.floor, max(one.spread, 1e-9), seen[best].square, seen[best].square_error)
+        floor = floors[best]
         off = min(abs(seen[best].bias), 0.9 * floor.value)
         return max(math.sqrt(floor.value**2 - off**2), LEAST), math.log1p(floor.error / max(floor.value, LEAST))
 
@@ -392,10 +403,16 @@ class _Planning:
         if not k:
             return floor
         off = math.hypot(bias, bias_error)
-        left = math.exp(-k / PER_E)
+        left = math.exp(-k / min(PER_E, self.length))
         texture = math.sqrt(max(floor.value**2 - off**2, 0.0)) * left
         value = math.hypot(texture, min(off, floor.value))
         return Belief(value, math.hypot(math.hypot(floor.error * left, FADING * texture), 0.5 * min(bias_error, value)))
+
+    @property
+    def length(self) -> float:
+        """How many grains light meets that meets any, by the reference: with fewer still to come less can be missed."""
+        assert self.reference is not None
+        return max(self.pilots[self.reference].seen.events / max(self.coverage, 1e-9), 1.0)
 
     def cost(self, candidate: Candidate) -> tuple[Seen, bool]:
         """Return variance and time of a sample, by its pilot or from those of others, and whether it was the former."""

@@ -108,7 +108,8 @@ def slab_error(level: str, body: Body, points: Points | None = None) -> tuple[fl
     """Return by how much a level is off in a slab like a body, over what comes back [1], and whether the atlas has it.
 
     Linear in mean cosine and packing fraction, and in the logarithms of thickness over l* and of co-albedo; beyond the
-    atlas it is what it is at its edge.
+    atlas it is what it is at its edge, but for lossless grains in deeper layers: there it falls as the light that comes
+    through, 1 / (1 + 3/4 thickness / l*).
     """
     p = points or atlas()
     if level == "explicit":
@@ -122,6 +123,8 @@ def slab_error(level: str, body: Body, points: Points | None = None) -> tuple[fl
         for f in range(len(p.packing_fraction)):
             layers = np.log(p.layer / p.transport[g, f])
             by_albedo = [float(np.interp(deep, layers, p.error[level][g, f, :, a])) for a in range(len(p.albedo))]
+            if deep > layers[-1]:
+                by_albedo[-1] *= (1.0 + 0.75 * math.exp(layers[-1])) / (1.0 + 0.75 * math.exp(deep))
             there = np.isfinite(by_albedo[::-1])
             by_fraction.append(float(np.interp(dark, darks[there], np.array(by_albedo[::-1])[there])))
         by_grain.append(float(np.interp(body.packing_fraction, p.packing_fraction, by_fraction)))
