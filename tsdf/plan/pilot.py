@@ -123,7 +123,9 @@ class Pilot:
         grey = float(variance.mean())
         events = sum(int(one.counters[0]) for one in self._walkers)
         error = math.sqrt(grey / (count * n)) / mean
-        return Seen(mean, error, grey / mean**2, self.timed / max(self.timed_samples, 1), events / (count * n), count * n)
+        return Seen(
+            mean, error, grey / mean**2, self.timed / max(self.timed_samples, 1), events / (count * n), count * n
+        )
 
     def pixel_means(self, half: int) -> np.ndarray:
         """Mean radiance of each pixel (n, 3) in one half."""

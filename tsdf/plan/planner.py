@@ -287,8 +287,8 @@ class _Planning:
 
         if self.reference is not None and not self.trusted(self.pilots[self.reference]):
             self.notes.append(
-                "single grains meet suns and small bright lights by chance alone, too seldom for pilots: errors are what "
-                "is expected of slabs, and levels that aim at lights are the safer choice"
+                "single grains meet suns and small bright lights by chance alone, too seldom for pilots: errors are "
+                "what is expected of slabs, and levels that aim at lights are the safer choice"
             )
 
     def finalists(self) -> list[Candidate]:

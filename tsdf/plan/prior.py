@@ -27,7 +27,8 @@ FILE = "level_errors.csv"
 LEAST = 0.003  # [1] that any level but explicit may be off by: packings differ, records are few
 SPREAD = math.log(2.5)  # of the logarithm of an error about what is expected
 THIN = 10.0  # [R] of spheres, whose texture `texture` is; that of thicker ones falls as one over thickness
-DEEP = 0.1  # of it that is left, however thick: light comes from one side
+DEEP = 0.25  # of it that is left at 40 R, and however thick: light comes from one side, and rims stay thin
+FACETED = 1.6  # times the texture of spheres, of grains with facets, which flash
 CLEAR = 1e-3  # co-albedo of a grain that stands for none in logarithms
 BLURRED = 0.3  # share of the texture that packed spheres miss which answer from records; facets miss all
 LEAST_SEEN = 0.05  # share of the picture that grains make, for their light falls on other things
@@ -161,7 +162,9 @@ def expected(level: str, body: Body, footprint: float, coverage: float) -> Expec
         optical = body.thickness / body.transport
         slab = math.hypot(slab, FILLS * 2.0 / body.transport / (optical + 4.0 / 3.0))
     grainy = float(texture(footprint)) * max(DEEP, min(1.0, THIN / body.thickness))
-    if traits.answered and body.round:
+    if not body.round:
+        grainy *= FACETED
+    elif traits.answered:
         grainy *= BLURRED
     return Expected(coverage * slab, share * math.hypot(0.5 * slab, grainy), SPREAD if known else 2.0 * SPREAD, known)
 
