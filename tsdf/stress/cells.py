@@ -19,19 +19,22 @@ from tsdf.data.table import Table
 from tsdf.scene.levels import LEVELS
 
 HOLDS, FAILS, UNSURE, NOT, TRUTH = "holds", "fails", "cannot tell", "does not apply", "the truth"
+REFUSED = "refused"  # begins a note: nothing was done, and this was said
 SIGMAS = 4.0  # standard errors beyond which a figure above the limit fails
 RESOLVED = 3.0  # standard errors that the limit is at least, where a cell holds
 
 TRACER, TABLES, HYBRID = "tracer", "tables", "5 explicit"
 LEAPS, VOLUME_LEAPS, ISOTROPIC_LEAPS = "memory + leaps", "volume + leaps", "isotropic + leaps"
 OURS = {
-    TRACER: "single grains: restart along the geometric normal, every split of light exact, no end but by light",
+    TRACER: "single grains as `tsdf-build` traces them",
     TABLES: "what tables hold and how they are drawn from",
-    **{name: f"level {name}" for name in LEVELS},
-    LEAPS: "level teleport-memory, many events in one step deep inside",
-    VOLUME_LEAPS: "the same, level volume",
-    ISOTROPIC_LEAPS: "the same, level isotropic",
-    HYBRID: "five explicit grains, then level teleport-memory",
+    **{name: f"level `{name}`" for name in LEVELS},
+    "teleport-joint": "level `teleport-joint`: exponential flights, without memory",
+    "teleport": "level `teleport`: exponential flights, independent offsets; as published",
+    LEAPS: "level `teleport-memory`, many events in one step deep inside",
+    VOLUME_LEAPS: "the same, level `volume`",
+    ISOTROPIC_LEAPS: "the same, level `isotropic`",
+    HYBRID: "five explicit grains, then level `teleport-memory`",
 }
 NAIVE = {
     "no offset": "rays start where they hit",
@@ -50,11 +53,10 @@ NAIVE = {
     "capped roulette": "paths go on with probability 0.95 at most, from the fifth event on, and are weighted for it",
     "depth cap": "paths end after 12 events",
     "4R/3f flights": "point scatterers with the mean free path 4 R / (3 f)",
-    "reset flights": "level teleport-memory, but each flight forgets where on its sphere light left",
+    "reset flights": "level `teleport-memory`, but each flight forgets where on its sphere light left",
     "untested jumps": "from entry to exit of a grain without a look at what lies between",
     "toggled medium": "inside becomes outside at each facet met, rays start 1e-4 further along",
     "leaps about p": "balls about where light is, not about where it will be in the mean",
-    "chance alone": "lights are found by chance only",
 }
 METHODS = OURS | NAIVE
 
@@ -73,7 +75,7 @@ class Measured(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """What was measured, the verdict, and the time that it took on the clock [s].
+    """What was measured, the verdict, and the processor time that it took [s].
 
     known: where it is documented that this method of ours fails here, "" where it is claimed to hold.
     """
@@ -227,18 +229,18 @@ class Setting:
         """Return the sphere that sends all light back from its surface."""
         return self.traced("sphere", 1e9)
 
-    def traced(self, name: str, eta: float, paths: int = 200_000) -> Table:
+    def traced(self, name: str, eta: float, paths: int = 200_000, **parameters: float) -> Table:
         """Return the table of a traced grain."""
 
         def make() -> Table:
             from tsdf.make.scatterometer import Build
 
-            grain = tsdf.load_grain(name)
+            grain = tsdf.load_grain(name, **parameters)
             built = Build.start(grain, tsdf.Optics(eta), tsdf.Effort(paths, cells=128, joint=16, memory=64))
             built.run(grain, self.threads or 2)
             return built.table()
 
-        made: Table = self.once((name, eta, paths), make)
+        made: Table = self.once((name, eta, paths, *parameters.items()), make)
         return made
 
 

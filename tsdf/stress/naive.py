@@ -90,9 +90,9 @@ def untested_jumps(
     return through
 
 
-def h_function(albedo: float, nodes: int = 256, rounds: int = 20_000) -> float:
-    """Return Chandrasekhar's H(1) for isotropic scatterers: a half-space of them sends back 1 - H(1) sqrt(1 - albedo) of
-    light that comes straight down (Chandrasekhar 1960, section 38)."""
+def h_function(albedo: float, nodes: int = 64, rounds: int = 20_000) -> float:
+    """Return Chandrasekhar's H(1) for isotropic scatterers: a half-space sends back 1 - H(1) sqrt(1 - albedo) of light
+    that comes straight down (Chandrasekhar 1960, section 38)."""
     x, w = np.polynomial.legendre.leggauss(nodes)
     mu, w = 0.5 * (x + 1.0), 0.5 * w
     root, h = math.sqrt(1.0 - albedo), np.ones(nodes)

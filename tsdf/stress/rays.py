@@ -14,7 +14,7 @@ from tsdf.judge import analytic
 from tsdf.make import tally as T
 from tsdf.make.tally import Tally
 from tsdf.make.tracer import MAX_BOUNCES, Tracer, in_order
-from tsdf.stress.cells import TABLES, TRACER, Measured, Row, Setting, mean_of, relative, share
+from tsdf.stress.cells import REFUSED, TABLES, TRACER, Measured, Row, Setting, mean_of, relative, share
 
 GROUP = "Rays at surfaces, light in one grain"
 ALONG, FIXED = 1e-6, 1e-4
@@ -62,7 +62,7 @@ def even(setting: Setting) -> Iterator[Measured]:
 
 
 def _inward(setting: Setting, ours: Grain, raw: np.ndarray, size: float) -> Iterator[Measured]:
-    """Light inside a convex grain must meet another of its facets: in the grain as we make it of a mesh, and in the mesh
+    """Light inside a convex grain must meet another of its facets: in the grain that we make of a mesh, and in the mesh
     as it comes, where rays restart as far from its facets, or so many scene units."""
     rays = setting.some(2_000_000)
     for method, vertices, offset in (
@@ -105,19 +105,25 @@ def vertices(setting: Setting) -> Iterator[Measured]:
     yield share("engine alone", len(lost), len(ways))
 
 
-def _ledger(grain: Grain, paths: int, setting: Setting, bounces: int = MAX_BOUNCES) -> np.ndarray:
+def _ledger(grain: Grain, paths: int, setting: Setting, bounces: int = MAX_BOUNCES, eta: float = ETA) -> np.ndarray:
     """Return scalar sums by replicate of a grain."""
     tally = Tally()
-    Tracer(grain, ETA, max_bounces=bounces, seed=setting.seed).trace(in_order(0, paths), tally)
+    Tracer(grain, eta, max_bounces=bounces, seed=setting.seed).trace(in_order(0, paths), tally)
     return tally.scalars.astype(np.float64)
 
 
-def trapped(setting: Setting) -> Iterator[Measured]:
+def trapped(setting: Setting, grain: Grain, eta: float) -> Iterator[Measured]:
     """Light that total reflection holds must come out, or be said to be missing."""
-    grain = load_grain("icosphere", subdivisions=4)
     for method, bounces in ((TRACER, MAX_BOUNCES), ("cap 10", 10), ("cap 32", 32)):
-        s = _ledger(grain, setting.some(400_000), setting, bounces)
+        s = _ledger(grain, setting.some(400_000), setting, bounces, eta)
         yield Measured(method, *mean_of(100.0 * (s[:, T.TRUNCATED] + s[:, T.LOST]) / s[:, T.LAUNCHED]))
+
+
+def bubble(setting: Setting) -> Iterator[Measured]:
+    """A sphere of eta .75 turns light as the analytic one does."""
+    s = _ledger(load_grain("sphere"), setting.some(1_000_000), setting, eta=0.75)
+    truth = analytic.sphere_statistics(0.75).mean_cosine
+    yield relative(TRACER, mean_of(s[:, T.COS_THETA] / s[:, T.SCATTERED]), (truth, 0.0))
 
 
 def facets(setting: Setting) -> Iterator[Measured]:
@@ -168,7 +174,7 @@ def hollow(setting: Setting) -> Iterator[Measured]:
         try:
             grain: Grain | None = load_grain(path)
         except GrainError as error:
-            yield Measured(TRACER, 0.0, note=f"refused: {error}")
+            yield Measured(TRACER, 0.0, note=f"{REFUSED}: {error}")
             grain = None
     for method, scene in ((TRACER, embree_scene(grain) if grain else None), ("as it comes", None)):
         if method == TRACER and scene is None:
@@ -214,7 +220,10 @@ ROWS = (
     Row("far", GROUP, "grain 1e4 R from the origin", "rays inside that meet no other facet", "%", 0.002, far),
     Row("small", GROUP, "grain of 1e-6 scene units", "rays inside that meet no other facet", "%", 0.002, small),
     Row("vertices", GROUP, "rays aimed at vertices", "rays that get out between facets", "%", 0.002, vertices),
-    Row("trapped", GROUP, "light held by total reflection, 5120 facets", "light missing", "%", 0.01, trapped),
+    Row("trapped", GROUP, "light held by total reflection, 5120 facets", "light missing", "%", 0.01,
+        lambda s: trapped(s, load_grain("icosphere", subdivisions=4), ETA)),
+    Row("diamond", GROUP, "light held by a cube, eta = 2.4", "light missing", "%", 0.01,
+        lambda s: trapped(s, load_grain("cube"), 2.4)),
     Row("facets", GROUP, "facets for a sphere, eta 1.33", "total variation of p_theta", "%", 0.5, facets),
     Row("inverted", GROUP, "mesh turned inside out", "mean cosine", "%", 2.0, inverted),
     Row("hole", GROUP, "mesh with a hole", "rays inside that get out through it", "%", 0.002, hollow),
@@ -222,5 +231,6 @@ ROWS = (
         "eta-1", GROUP, "eta = 1.005", "1 - g", "%", 5.0, nearly_alike,
         known={"teleport-memory": "memory.md, How right it is"},
     ),
+    Row("bubble", GROUP, "bubble, eta = .75", "mean cosine", "%", 0.5, bubble),
     Row("mirror", GROUP, "mirror", "mean cosine times 100", "1", 0.5, turned_back),
 )  # fmt: skip

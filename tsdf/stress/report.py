@@ -8,7 +8,20 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from itertools import groupby, zip_longest
 
-from tsdf.stress.cells import FAILS, HOLDS, METHODS, NOT, OURS, RESOLVED, SIGMAS, TRUTH, UNSURE, Cell, Row
+from tsdf.stress.cells import (
+    FAILS,
+    HOLDS,
+    NAIVE,
+    NOT,
+    OURS,
+    REFUSED,
+    RESOLVED,
+    SIGMAS,
+    TRUTH,
+    UNSURE,
+    Cell,
+    Row,
+)
 from tsdf.stress.rows import Done, Report
 
 WIDTHS = (38, 38, 38)  # columns of a terminal: the situation, ours, others; with what is between them 120
@@ -137,28 +150,28 @@ def _marked(cell: Cell) -> str:
     text = figure(cell.measured.value, cell.measured.error)
     if cell.verdict == TRUTH:
         return f"truth, {cell.measured.note} ± {cell.measured.error:.2g} %"
+    if cell.measured.note.startswith(REFUSED):
+        return REFUSED
     if cell.verdict in (HOLDS, NOT):
         return f"{word(cell)} {text}".strip()
     return f"**{word(cell)}** {text}"
 
 
 def notes(report: Report) -> list[str]:
-    """Return what of ours fails, line by line: known first, and the better level beside it."""
+    """Return what of ours fails, a line for each situation and place where it is documented, and what holds there."""
     lines = []
-    for row, cell in [*report.broken, *report.known]:
-        done = next(one for one in report.done if one.row is row)
-        good = [
-            f"{c.measured.method} {figure(c.measured.value, c.measured.error)}"
-            for c in done.cells
-            if c.ours and c.verdict == HOLDS
-        ]
-        where = f"[{cell.known}]({cell.known.partition(',')[0]})" if cell.known else "**nowhere documented**"
-        m = cell.measured
-        better = f"; holds: {', '.join(good)}" if good else ""
-        lines.append(
-            f"- {row.title}: `{m.method}` {figure(m.value, m.error)} {row.unit.replace('1', '')}".rstrip()
-            + f" of {row.figure}; {where}{better}"
-        )
+    for one in report.done:
+        ours = [cell for cell in one.cells if cell.ours]
+        good = [f"`{c.measured.method}`" for c in ours if c.verdict == HOLDS]
+        for known in dict.fromkeys(cell.known for cell in ours if cell.verdict == FAILS):
+            bad = [c.measured for c in ours if c.verdict == FAILS and c.known == known]
+            unit = one.row.unit.replace("1", "")
+            said = ", ".join(f"`{m.method}` {figure(m.value, m.error)} {unit}".rstrip() for m in bad)
+            file, _, section = known.partition(", ")
+            where = f"[{section}]({file})" if known else "**claimed to hold**"
+            lines.append(
+                f"- {one.row.title}, {one.row.figure}: {said} ({where}). " + f"Holds: {', '.join(good) or 'none'}."
+            )
     return lines
 
 
@@ -178,46 +191,65 @@ def csv_text(report: Report) -> str:
     return text.getvalue()
 
 
+LEFT, TOP, WIDE, HIGH, OTHER = (
+    290,
+    105,
+    68,
+    18,
+    160,
+)  # of the picture: margins, cells of ours, width of one of others [px]
+
+
 def svg(report: Report) -> str:
-    """Return the whole matrix as a picture: rows are situations, columns methods, a cell has its figure."""
-    methods = [m for m in METHODS if any(c.measured.method == m for one in report.done for c in one.cells)]
-    left, top, wide, high, size = 330, 130, 62, 17, 10
-    width, height = left + wide * len(methods) + 60, top + high * (len(report.done) + 2) + 10
+    """Return the whole matrix as a picture: rows are situations, columns methods of ours, others stand behind them."""
+    ours = [m for m in OURS if any(c.measured.method == m for one in report.done for c in one.cells)]
+    most = max((sum(not cell.ours for cell in one.cells) for one in report.done), default=0)
+    width, height = LEFT + WIDE * len(ours) + OTHER * most + 10, TOP + HIGH * (len(report.done) + 2)
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" viewBox="0 0 {width} {height}" '
-        f'font-family="sans-serif" font-size="{size}">',
+        'font-family="sans-serif" font-size="10">',
         f'<rect width="{width}" height="{height}" fill="#ffffff"/>',
     ]
-    for k, method in enumerate(methods):
-        x = left + wide * (k + 0.5)
-        style = ' font-weight="bold"' if method in OURS else ""
-        parts.append(f'<text transform="translate({x:.0f},{top - 6}) rotate(-50)"{style}>{escape(method)}</text>')
-    for j, one in enumerate(report.done):
-        y = top + high * j
-        parts.append(f'<text x="{left - 6}" y="{y + 12}" text-anchor="end">{escape(one.row.title)}</text>')
-        for cell in one.cells:
-            x = left + wide * methods.index(cell.measured.method)
-            colour = COLOURS["known" if word(cell) == "known" else cell.verdict]
-            text = "truth" if cell.verdict == TRUTH else figure(cell.measured.value, cell.measured.error) or "-"
-            parts.append(
-                f'<rect x="{x}" y="{y}" width="{wide - 1}" height="{high - 1}" fill="{colour}" stroke="#888888" '
-                f'stroke-width="0.5"/>'
-                f'<text x="{x + wide / 2:.0f}" y="{y + 12}" text-anchor="middle" font-size="{size - 1}">'
-                f"{escape(text)}</text>"
-            )
-    y = top + high * (len(report.done) + 1)
-    x = left
-    for name, colour in COLOURS.items():
-        said = "fails as documented" if name == "known" else name
+    for k, method in enumerate(ours):
         parts.append(
-            f'<rect x="{x}" y="{y}" width="12" height="12" fill="{colour}" stroke="#888888" stroke-width="0.5"/>'
-            f'<text x="{x + 16}" y="{y + 10}">{said}</text>'
+            f'<text transform="translate({LEFT + WIDE * k + 20},{TOP - 5}) rotate(-40)">{escape(method)}</text>'
         )
-        x += 120
+    if most:
+        parts.append(f'<text x="{LEFT + WIDE * len(ours)}" y="{TOP - 5}">others</text>')
+    for j, one in enumerate(report.done):
+        y, at = TOP + HIGH * j, LEFT + WIDE * len(ours)
+        parts.append(f'<text x="{LEFT - 6}" y="{y + 12}" text-anchor="end">{escape(one.row.title)}</text>')
+        for cell in one.cells:
+            m = cell.measured
+            text = "truth" if cell.verdict == TRUTH else figure(m.value, m.error) or "-"
+            if cell.ours:
+                x, size = LEFT + WIDE * ours.index(m.method), WIDE
+            else:
+                x, size, text = at, OTHER, f"{m.method} {text}"
+                at += OTHER
+            colour = COLOURS["known" if word(cell) == "known" else cell.verdict]
+            parts.append(_box(x, y, size - 1, HIGH - 1, colour))
+            parts.append(f'<text x="{x + size / 2:g}" y="{y + 12}" text-anchor="middle">{escape(text)}</text>')
+    for k, (name, colour) in enumerate(COLOURS.items()):
+        x, y = LEFT + 130 * k, TOP + HIGH * len(report.done) + 12
+        said = "fails as documented" if name == "known" else name
+        parts += [_box(x, y, 12, 12, colour), f'<text x="{x + 16}" y="{y + 10}">{said}</text>']
     return "\n".join([*parts, "</svg>", ""])
 
 
-def page(report: Report, command: str, machine: str = "") -> str:
+def _box(x: float, y: float, width: float, height: float, colour: str) -> str:
+    return f'<rect x="{x}" y="{y}" width="{width}" height="{height}" fill="{colour}" stroke="#888888"/>'
+
+
+def methods_of(report: Report) -> list[str]:
+    """Return the lines of a table that says what the methods are."""
+    seen = {cell.measured.method for one in report.done for cell in one.cells}
+    sides = [[(m, said) for m, said in some.items() if m in seen] for some in (OURS, NAIVE)]
+    pairs = zip_longest(*sides, fillvalue=("", ""))
+    return [f"| {mine[0]} | {mine[1]} | {other[0]} | {other[1]} |" for mine, other in pairs]
+
+
+def page(report: Report, command: str) -> str:
     """Return docs/stress.md."""
     found = notes(report)
     return "\n".join(
@@ -228,14 +260,9 @@ def page(report: Report, command: str, machine: str = "") -> str:
             f"software does. Measured by `{command}`; this page is what it wrote.",
             "",
             *(f"- {line}" for line in READING),
-            "- Others, in the last column, are a few lines of numpy each, as textbooks and renderers have them: "
-            + "; ".join(f"{method}: {said}" for method, said in METHODS.items() if method not in OURS)
-            + ".",
-            "- Columns of ours: "
-            + "; ".join(f"{m}: {said}" for m, said in OURS.items() if not said.startswith("level ") or m not in said)
-            + ".",
-            "- Exit status 1 says that one of ours fails where it is claimed to hold. `--quick` takes half a minute, and the",
-            "  tests run it; the whole takes some minutes; the first run on a machine compiles and packs grains before.",
+            "- **refused**: in one line, and so no wrong table is made.",
+            "- Exit status 1: one of ours fails where it is claimed to hold. `--quick`, which the tests run, takes",
+            "  half a minute, the whole some minutes; the first run on a machine compiles and packs grains first.",
             "",
             "![the matrix](stress.svg)",
             "",
@@ -246,6 +273,15 @@ def page(report: Report, command: str, machine: str = "") -> str:
             "## The matrix",
             "",
             markdown(report).rstrip(),
+            "",
+            "## Methods",
+            "",
+            "Others are a few lines of numpy each (`tsdf/stress/`), as textbooks and renderers have them, with nothing",
+            "else wrong; reset flights and leaps about p are our own level with one thing taken away.",
+            "",
+            "| ours | what it is | others | what it is |",
+            "|---|---|---|---|",
+            *methods_of(report),
             "",
             *(f"{line}  " for line in summary(report)),
             "",

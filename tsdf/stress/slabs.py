@@ -21,7 +21,6 @@ PACKED = ("explicit", "teleport-packed", HYBRID)
 SIMPLE = ("4R/3f flights", "reset flights")
 FORGETS = "memory.md, How right it is"
 FORGETFUL = {"teleport-joint": FORGETS, "teleport": FORGETS, "volume": FORGETS}
-DARK = dict.fromkeys(FORGETFUL, "stress.md, What fails among ours")
 BACK = "memory.md, What it cannot know"
 PATHS = 600_000  # of each level; of explicit twice as many
 
@@ -42,6 +41,8 @@ def grain_of(setting: Setting, name: str) -> GrainSpec:
     table: Table = {
         "ball": lambda: setting.ball, "mirror": lambda: setting.mirror, "cube": lambda: setting.traced("cube", 1.31),
         "nearly": lambda: setting.once("nearly", lambda: _ball(setting, 1.02)), "own": lambda: setting.own,
+        "bubble": lambda: setting.once("bubble", lambda: _ball(setting, 0.75)),
+        "plates": lambda: setting.traced("hexprism", 1.31, 1_000_000, aspect=0.1),
     }[name]()  # fmt: skip
     return GrainSpec(table, mesh=setting.mesh if name == "own" else None)
 
@@ -60,7 +61,8 @@ def forgotten(world: World, rng: np.random.Generator) -> None:
     turn = rng.uniform(0.0, math.pi, len(flat))
     flat[:, 2], flat[:, 3] = np.cos(turn), np.sin(turn)
     known[:] = flat.reshape(known.shape)
-    world.memory = world.memory._replace(law=law)
+    gaps = np.concatenate(([0.0], np.cumsum(law[0, :, :, 0].astype(np.float64))))  # by which first flights begin in one
+    world.memory = world.memory._replace(law=law, gaps=(gaps / gaps[-1])[None])
 
 
 def experiment(setting: Setting, method: str, case: Case, packing: int = 0, top: float = 0.0) -> Experiment:
@@ -84,7 +86,11 @@ def reflected(setting: Setting, method: str, case: Case, number: int) -> tuple[f
     """Return the reflectance of a slab and its standard error, of packed grains over packings and places in them."""
     several = method in PACKED
     packings = range(2 if setting.quick else 8) if several else (0,)
-    places = [(k, top) for k in packings for top in (cuts(case.fraction, case.layer) if several else [0.0])]
+    places = [
+        (k, top)
+        for k in packings
+        for top in (cuts(case.fraction, case.layer)[: 2 if setting.quick else 4] if several else [0.0])
+    ]
     paths = case.times * setting.some(PATHS) * (2 if method == "explicit" else 1)
     mean, squares, spread = 0.0, 0.0, []
     for k, (packing, top) in enumerate(places):
@@ -173,18 +179,22 @@ def _slab(
 
 ROWS = (
     _slab("thin", "layer of 2 R", Case("ball", 0.6, 2.0, times=3), 6.0),
+    _slab("monolayer", "layer of .5 R, light at 60 degrees", Case("ball", 0.6, 0.5, 0.5, times=3), 6.0, quick=False),
     _slab("thin-60", "layer of 2 R, light at 60 degrees", Case("ball", 0.6, 2.0, 0.5), 6.0, quick=False),
     _slab("thin-4", "layer of 4 R, light at 60 degrees", Case("ball", 0.6, 4.0, 0.5), 4.0, quick=False),
     _slab("grazing", "layer of 10 R, sun 5 degrees high", Case("ball", 0.6, 10.0, math.sin(math.radians(5.0))), 4.0),
     _slab("f-01", "layer of 40 R, f = .01", Case("ball", 0.01, 40.0, times=2), 12.0, {}),
     _slab("f-30", "layer of 10 R, f = .3", Case("ball", 0.3, 10.0), 4.0, quick=False),
     _slab("f-64", "layer of 10 R, f = .64", Case("ball", 0.64, 10.0), 4.0, quick=False),
+    _slab("f-57", "layer of 10 R, f = .57, between those tabulated", Case("ball", 0.57, 10.0), 3.0, quick=False),
     _slab("deep", "layer of 40 R, f = .6", Case("ball", 0.6, 40.0), 2.0, quick=False),
-    _slab("dark", "layer of 10 R, light that gets in is absorbed", Case("ball", 0.6, 10.0, 1.0, 50.0, 4), 12.0, DARK),
+    _slab("dark", "layer of 10 R, light that gets in is absorbed", Case("ball", 0.6, 10.0, 1.0, 50.0, 4), 12.0),
     _slab("mirrors", "layer of 10 R of mirrors", Case("mirror", 0.6, 10.0), 2.0),
     _slab("eta-102", "layer of 40 R, eta = 1.02", Case("nearly", 0.6, 40.0, times=2), 20.0,
           FORGETFUL | {"teleport-memory": FORGETS}, False),
     _slab("facets-traced", "layer of 10 R of cubes, eta = 1.31", Case("cube", 0.6, 10.0), 4.0, quick=False),
+    _slab("bubbles", "layer of 10 R of bubbles, eta = .75", Case("bubble", 0.6, 10.0), 3.0, quick=False),
+    _slab("plates", "layer of 10 R of plates, half of which are missed", Case("plates", 0.6, 10.0), 4.0, quick=False),
     Row("mirrors-bulk", GROUP, "endless mirrors, f = .6", "squared displacement", "%", 4.0,
         lambda s: bulk(s, "mirror", 0.6), FORGETFUL | {"teleport-memory": BACK}),
     Row("mixture", GROUP, "mirrors and clear spheres, half and half", "reflectance", "%", 4.0, mixture,
