@@ -49,6 +49,7 @@ def main(
         raise UsageError("--mesh is of the grain of a TABLE: name it")
 
     from tsdf.data import format as tsdf_format
+    from tsdf.stress import report
     from tsdf.stress.cells import Setting
     from tsdf.stress.rows import chosen, measure
 
@@ -70,8 +71,6 @@ def main(
 
         with interruptible(work.meaning, raises=True):
             found = measure(some, setting, plain(table.name) if table is not None else "ready tables", told)
-
-    from tsdf.stress import report
 
     if out is not None:
         words = ["tsdf-stress", *([plain(table)] if table else []), *(["--quick"] if quick else [])]
