@@ -42,6 +42,10 @@ tables: .venv/installed  ## build the tables that the scenes name, into demo/
 library: .venv/installed  ## make the ready tables of the package and their page again, to the same bytes
 	$(BIN)/python -m tsdf.reference_data.make_library
 
+stress: .venv/installed  ## measure where methods fail, and make docs/stress.md and its picture of it
+	$(BIN)/tsdf-stress --out stress
+	cp stress/stress.md stress/stress.svg docs/
+
 gallery: tables  ## the scenes large and the chart of errors, into gallery/; SECONDS=900 is the time for each picture
 	mkdir -p gallery
 	$(BIN)/tsdf-plot demo/snow.tsdf.exr --out gallery/snow.png
@@ -91,4 +95,4 @@ fuzz: .venv/installed  ## throw damaged and hostile files and signals at everyth
 	for name in $(FUZZERS); do \
 		$(BIN)/python fuzz/$$name.py $(if $(COUNT),--count $(COUNT)) --seed $(or $(SEED),0) || exit; done
 
-.PHONY: help install demo tables library gallery pictures test test-fast check docs bench fuzz
+.PHONY: help install demo tables library stress gallery pictures test test-fast check docs bench fuzz

@@ -32,6 +32,7 @@ HEAVY = (
     "tsdf-packing",
     "tsdf-preview",
     "tsdf-render",
+    "tsdf-stress",
 )
 
 silent = False  # standard output was closed when the process began
@@ -188,8 +189,11 @@ def _command(name: str) -> Callable[[], None]:
     return run
 
 
-(accuracy, albedo, build, compare, export, grains, info, merge, optics, packing, plot, preview, render, validate) = map(
+(
+    accuracy, albedo, build, compare, export, grains, info, merge, optics, packing, plot, preview, render, stress,
+    validate,
+) = map(
     _command,
     ("accuracy", "albedo", "build", "compare", "export", "grains", "info", "merge", "optics", "packing", "plot",
-     "preview", "render", "validate"),
+     "preview", "render", "stress", "validate"),
 )  # fmt: skip
