@@ -16,6 +16,8 @@ import pytest
 from scipy.special import stdtr
 
 from tsdf.cli.frontier import main
+from tsdf.data import format as tsdf_format
+from tsdf.data import library
 from tsdf.data.table import Table
 from tsdf.errors import TSDFError, UsageError
 from tsdf.grain.grains import load_grain
@@ -25,11 +27,22 @@ from tsdf.picture import render
 from tsdf.picture.render import Picture
 from tsdf.picture.world import build
 from tsdf.scene.levels import LEVELS
-from tsdf.scene.scene import Camera, ConstantLight, GrainSpec, MediumSpec, Scene, Sphere, SurfaceSpec
+from tsdf.scene.scene import (
+    Camera,
+    ConstantLight,
+    GrainSpec,
+    MediumSpec,
+    Scene,
+    Sphere,
+    SunLight,
+    SurfaceSpec,
+    load,
+)
 from tsdf.study import frontier, frontier_files, frontier_plots
 from tsdf.study.candidates import Candidate, candidates, taken
 from tsdf.study.frontier import Frontier, Measured, square
 from tsdf.study.ranking import mean_of
+from tsdf.walk.explicit import built_in
 
 SIGMAS = 4.5
 RUNS = 8
@@ -295,6 +308,35 @@ def test_charts_draw_no_limit_as_a_measurement(found: Frontier) -> None:
         for ticks, (low, high) in ((axes.get_xticks(), axes.get_xlim()), (axes.get_yticks(), axes.get_ylim())):
             assert 2 <= len(ticks) <= 14
             assert (np.diff(np.log(ticks)) > 0.05 * math.log(high / low)).all()
+
+
+SHIPPED = sorted((Path(__file__).parents[2] / "scenes" / "frontier").glob("*.toml"))
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_shipped_scenes_need_nothing_but_the_package(path: Path) -> None:
+    """Each is small, of ready tables whose grains can be traced, with boundaries that mean the same at all levels and
+    no light that is too small for single grains to meet."""
+    scene = load(path)
+    assert scene.camera.width * scene.camera.height <= 72 * 64
+    for medium in scene.media:
+        assert medium.inside == "centres" and medium.packing_fraction <= 0.64
+        for grain in medium.grains:
+            assert not isinstance(grain.table, Table) and grain.table.parent == library.FOLDER
+            read = tsdf_format.read(grain.table)
+            assert built_in(read) and read.joint and read.memory
+    assert all(light.angular_diameter_deg >= 30.0 for light in scene.lights if isinstance(light, SunLight))
+
+
+def test_shipped_scenes_cover_what_sets_methods_apart() -> None:
+    scenes = [load(path) for path in SHIPPED]
+    media = [medium for scene in scenes for medium in scene.media]
+    assert len(scenes) >= 6
+    assert min(m.packing_fraction for m in media) <= 0.1 and max(m.packing_fraction for m in media) >= 0.6
+    assert any(len(m.grains) > 1 for m in media) and any(scene.surfaces for scene in scenes)
+    assert {m.grains[0].absorption.coefficient != (0.0,) for m in media} == {True, False}
+    kinds = {tsdf_format.read(m.grains[0].table).header["grain"]["kind"] for m in media}  # type: ignore[arg-type]
+    assert kinds == {"sphere", "mesh"}
 
 
 # ----------------------------------------------------------------------------------------------- command

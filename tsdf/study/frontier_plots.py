@@ -50,14 +50,15 @@ def plot_frontiers(frontiers: Sequence[Frontier]) -> Any:
     with matplotlib.rc_context(STYLE):
         columns = min(COLUMNS, len(frontiers))
         rows = -(-len(frontiers) // columns)
-        figure = Figure(figsize=(3.7 * columns, 3.1 * rows + 0.9), layout="constrained")
+        figure = Figure(figsize=(3.7 * columns, 3.1 * rows + 0.9 + 0.5 * (columns < COLUMNS)), layout="constrained")
         places = figure.subplots(rows, columns, squeeze=False).ravel()
         for axes, frontier in zip(places, frontiers, strict=False):
             _against_time(axes, frontier)
             axes.set_title(_title(frontier))
         for axes in places[len(frontiers) :]:
             axes.set_axis_off()
-        figure.legend(handles=_keys(frontiers), loc="outside lower center", ncols=6, frameon=False, handlelength=2.4)
+        keys, wide = _keys(frontiers), 2 * columns
+        figure.legend(handles=keys, loc="outside lower center", ncols=wide, frameon=False, handlelength=2.4)
     return figure
 
 
