@@ -27,7 +27,7 @@ HEAVY = (
     "tsdf-accuracy",
     "tsdf-albedo",
     "tsdf-build",
-    "tsdf-compare",
+    "tsdf-frontier",
     "tsdf-optics",
     "tsdf-packing",
     "tsdf-preview",
@@ -190,10 +190,10 @@ def _command(name: str) -> Callable[[], None]:
 
 
 (
-    accuracy, albedo, build, compare, export, grains, info, merge, optics, packing, plot, preview, render, stress,
+    accuracy, albedo, build, export, frontier, grains, info, merge, optics, packing, plot, preview, render, stress,
     validate,
 ) = map(
     _command,
-    ("accuracy", "albedo", "build", "compare", "export", "grains", "info", "merge", "optics", "packing", "plot",
+    ("accuracy", "albedo", "build", "export", "frontier", "grains", "info", "merge", "optics", "packing", "plot",
      "preview", "render", "stress", "validate"),
 )  # fmt: skip

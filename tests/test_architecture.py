@@ -29,7 +29,7 @@ DOORS = {
     "PIL": {"image"},
     "skimage": {"volumes"},
     "tifffile": {"volumes"},
-    "matplotlib": {"plots", "spectral_plots"},
+    "matplotlib": {"plots", "frontier_plots", "spectral_plots"},
     "jsonschema": {"container"},
     "yaml": {"constants"},
 }

@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -62,6 +62,8 @@ class Picture:
         How many of the events were not drawn one by one, and how many leaps stand for them.
     trust : Trust, optional
         Whether its variance is to be believed; None where there is no variance, or nobody has looked.
+    processor_seconds : float
+        Time that the processors spent on it, all threads together, and whatever else the process did meanwhile.
     """
 
     rgb: np.ndarray
@@ -76,6 +78,7 @@ class Picture:
     leapt: int = 0
     leaps: int = 0
     trust: Trust | None = None
+    processor_seconds: float = 0.0
 
     @property
     def relative_error(self) -> float:
@@ -252,7 +255,7 @@ def measure(
     for walkers in pool:
         walkers.counters[:] = 0
     free = list(pool)
-    begin = time.perf_counter()
+    begin, worked = time.perf_counter(), time.process_time()
 
     def follow(block: Portion) -> np.ndarray:
         mine = free.pop()
@@ -265,7 +268,8 @@ def measure(
         return time.perf_counter() - begin
 
     def picture(interrupted: bool) -> Picture:
-        return sums.picture(np.sum([walkers.counters for walkers in pool], axis=0), spent(), interrupted)
+        made = sums.picture(np.sum([walkers.counters for walkers in pool], axis=0), spent(), interrupted)
+        return replace(made, processor_seconds=time.process_time() - worked)
 
     done, share, took, reached = 0, 0, 0.0, math.inf
     with ThreadPoolExecutor(threads) as executor:
