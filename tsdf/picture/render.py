@@ -227,8 +227,9 @@ def render(
             f"{world.scene.name}: a camera looking at nothing: it sees neither a medium nor a surface; move its target"
         )
     return measure(
-        world, camera_of(world), camera.width, camera.height, spp, seconds, target_error, seed, threads, progress, stop
-    )
+        world, camera_of(world), camera.width, camera.height, spp, seconds, target_error, seed, threads, progress, stop,
+        world.met,
+    )  # fmt: skip
 
 
 def measure(
@@ -243,6 +244,7 @@ def measure(
     threads: int | None = None,
     progress: Callable[[float, str], None] | None = None,
     stop: threading.Event | None = None,
+    already: np.ndarray = transport.NOBODY,
 ) -> Picture:
     """Return the picture that any camera takes, as `render` does for the scene's own; of a parallel beam, say."""
     goal = Goal(spp, seconds, target_error)
@@ -260,7 +262,8 @@ def measure(
     def follow(block: Portion) -> np.ndarray:
         mine = free.pop()
         try:
-            return mine.follow(transport.Job(camera, block.pixel, block.number, block.sample, seed), block.pixels, halt)
+            job = transport.Job(camera, block.pixel, block.number, block.sample, seed, already)
+            return mine.follow(job, block.pixels, halt)
         finally:
             free.append(mine)
 
