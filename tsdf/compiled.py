@@ -22,8 +22,16 @@ import numba
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import caching, cgutils, cpu, event, types
 from numba.extending import intrinsic
+from numba.np import linalg
 
 from tsdf.files import whole
+
+# Before its first kernel numba looks whether scipy has a BLAS, which takes .15 s to import. It has, and who multiplies
+# matrices in a kernel asks for it again.
+_ensure_blas, linalg.ensure_blas = linalg.ensure_blas, bool
+import numba.np.arraymath  # noqa: E402
+
+linalg.ensure_blas = _ensure_blas
 
 PACKAGE = Path(__file__).parent
 _IMPORTS = re.compile(r"^from tsdf((?:\.\w+)*) import\s+([^(\n]+|\([^)]*\))", re.MULTILINE)

@@ -28,8 +28,8 @@ def test_a_simplex_walks_as_scipys(valley):
             where.append(x.tolist())
             return VALLEYS[valley](x)
 
-        theirs = minimize(watched, start, (seen[0],), method="Nelder-Mead",
-                          options={"initial_simplex": corners, "xatol": 1e-6, "fatol": 1e-8, "maxiter": 400})  # fmt: skip
+        options = {"initial_simplex": corners, "xatol": 1e-6, "fatol": 1e-8, "maxiter": 400}
+        theirs = minimize(watched, start, (seen[0],), method="Nelder-Mead", options=options)
         place, value = lowest(lambda x, where=seen[1]: watched(x, where), corners, 1e-6, 1e-8)
         assert seen[0] == seen[1]
         assert (place == theirs.x).all() and value == theirs.fun
@@ -37,7 +37,7 @@ def test_a_simplex_walks_as_scipys(valley):
 
 @pytest.mark.parametrize("edges", [0, 1, 300, 700, 3000])
 def test_components_are_scipys(edges):
-    """Of random graphs of 1000 nodes from none to many edges, and of a long chain in a bad order, with their numbers."""
+    """Of random graphs of 1000 nodes, from no edge to many, and of a long chain in a bad order; numbers too."""
     rng = np.random.default_rng(edges)
     chain = rng.permutation(1000)
     for first, second in (rng.integers(1000, size=(2, edges)), (chain[:-1], chain[1:])):

@@ -1,6 +1,7 @@
 """Simplex: where a function of a few numbers is lowest, without derivatives.
 
-Here and not scipy's, which takes longer to import than all searches of a build take; steps are the same to the last bit.
+Here and not scipy's, which takes longer to import than all searches of a build take; its steps are the
+same to the last bit.
 """
 
 from collections.abc import Callable
