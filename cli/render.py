@@ -67,7 +67,7 @@ def main(
     if sum(stop is not None for stop in (spp, seconds, target_error)) > 1:
         raise UsageError("--spp, --seconds and --target-error each say when to stop: give one")
 
-    from tsdf.picture import image, leaping, render, world
+    from tsdf.picture import leaping, render, world
     from tsdf.scene.scene import MAX_EXPLICIT, load, resized
     from tsdf.scene.specs import files_of
 
@@ -92,7 +92,6 @@ def main(
         made = world.build(read, level or read.render.level, leap=leap, progress=work.told)
         for note in made.notes:
             work.progress.note(note)
-        image.prepare()
         work.told(0.0, "starting")
         picture = render.render(made, spp, seconds, target_error, seed, threads, told, work.stop)
         if not picture.samples.any():

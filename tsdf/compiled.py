@@ -92,18 +92,28 @@ def imported(name: str) -> frozenset[str]:
     found, waiting = set(), [name]
     while waiting:
         one = waiting.pop()
-        if one in found or not _file(one).is_file():
+        if one in found or _text(one) is None:
             continue
         found.add(one)
-        for inside, names in _IMPORTS.findall(_file(one).read_text(encoding="utf-8")):
-            each = re.findall(r"(\w+)(?:\s+as\s+\w+)?\s*(?:,|\)|$)", names)
-            waiting += [inside[1:], *(f"{inside}.{word}".lstrip(".") for word in each)]
+        waiting += _named(one)
     return frozenset(found)
 
 
-def _file(name: str) -> Path:
-    """Return the file of a module of this name, whether there is one or not."""
-    return PACKAGE.joinpath(*name.split(".")).with_suffix(".py")
+@cache
+def _named(name: str) -> list[str]:
+    """Return what may be the modules that one imports of the package."""
+    named = []
+    for inside, names in _IMPORTS.findall((_text(name) or b"").decode()):
+        each = re.findall(r"(\w+)(?:\s+as\s+\w+)?\s*(?:,|\)|$)", names)
+        named += [inside[1:], *(f"{inside}.{word}".lstrip(".") for word in each)]
+    return named
+
+
+@cache
+def _text(name: str) -> bytes | None:
+    """Return the text of a module of this name, None if there is none."""
+    file = PACKAGE.joinpath(*name.split(".")).with_suffix(".py")
+    return file.read_bytes() if file.is_file() else None
 
 
 @cache
@@ -114,7 +124,7 @@ def stamp(name: str) -> str:
     """
     digest = hashlib.sha256()
     for one in sorted(imported(name) | imported("compiled") | imported("handle")):
-        digest.update(hashlib.sha256(_file(one).read_bytes()).digest())
+        digest.update(hashlib.sha256(_text(one) or b"").digest())
     return digest.hexdigest()
 
 
