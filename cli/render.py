@@ -144,10 +144,10 @@ def summary(world: "World", picture: "Picture", out: Path) -> None:
     singles = world.scene.render.explicit_grains
     after = f" after {singles} explicit grains" if singles else ""
     state = "interrupted: holds" if picture.interrupted else "holds"
+    error = f"{picture.relative_error:.2g}" if math.isfinite(picture.relative_error) else "unknown"
     say(
-        f"{plain(out)}: {state} {held} samples per pixel, level {world.level}{after}, relative error "
-        f"{picture.relative_error:.2g}, {picture.seconds:.1f} s, {picture.events / max(picture.seconds, 1e-9):.3g} "
-        "grain events per second"
+        f"{plain(out)}: {state} {held} samples per pixel, level {world.level}{after}, relative error {error}, "
+        f"{picture.seconds:.1f} s, {picture.events / max(picture.seconds, 1e-9):.3g} grain events per second"
     )
     for line in media(world):
         say(line)
