@@ -10,7 +10,7 @@ from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.picture import render, world
-from tsdf.picture.render import Picture, Portion, Sums
+from tsdf.picture.render import BLOCK, FEW, Goal, Picture, Portion, Sums
 from tsdf.picture.trust import Moments, Trust, kurtosis_of
 from tsdf.scene.scene import Camera, GrainSpec, MediumSpec, Scene, Sphere, SunLight, SurfaceSpec
 from tsdf.walk.lights import compile_lights
@@ -163,3 +163,16 @@ def test_a_pixel_of_one_sample_has_a_variance() -> None:
     begun = sums(10, 10, 0.0, 50, 0)
     assert np.isfinite(begun.variance[:5]).all() and np.isinf(begun.variance[5:]).all()
     assert begun.relative_error == math.inf and np.isinf(sums(1, 1, 0.0, 1, 0).variance).all()
+
+
+@pytest.mark.parametrize("goal", [Goal(10**6, None, None), Goal(None, 1e6, None), Goal(None, None, 1e-9)])
+@pytest.mark.parametrize("count", [1, 768, 10**6])
+def test_no_pixel_is_far_behind(goal: Goal, count: int) -> None:
+    """Whenever a picture is interrupted, pixels have half as many samples as others at least, once they have 16 or the
+    picture has 65,536; and yet a million samples of a pixel take few passes where they are not many in all."""
+    done, share, passes = 0, 0, 0
+    while done < 10**6 and (share := goal.following(done, share, 1e-3 * share, 0.0, count)) > 0:
+        if done > max(FEW, BLOCK // count):
+            assert share <= done
+        done, passes = done + share, passes + 1
+    assert done >= 10**6 and (count > 1 or passes <= 12)

@@ -437,7 +437,8 @@ class Goal:
 
         Each of `count` pixels has `done` of them after `spent` seconds; the last pass had `share` and `took` seconds.
         """
-        most = max(FEW, PARTS * BLOCK // count)
+        # after the first seconds an interrupt leaves no pixel with less than half the samples of another
+        most = max(FEW, min(PARTS * BLOCK // count, max(BLOCK // count, done)))
         if self.spp is not None:
             return min(most if share else 1, self.spp - done)
         if self.seconds is None:
