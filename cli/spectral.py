@@ -5,16 +5,14 @@ import io
 import json
 import math
 import os
-import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from tsdf.cli.absorption import METRES
 from tsdf.cli.common import check_output, say, setting, whole_number
-from tsdf.cli.sizes import by_option
+from tsdf.cli.sizes import by_option, measured
 from tsdf.errors import UsageError
 
 if TYPE_CHECKING:
@@ -34,16 +32,10 @@ def metres(context: click.Context, parameter: click.Parameter, value: str | None
     """Read a length, "0.2mm" say; without a unit it is in metres."""
     if value is None:
         return None
-    found = re.fullmatch(r"\s*([-+.0-9eE]+)\s*([a-z]*)\s*", value)
-    try:
-        if found is None or found[2] not in ("", *METRES):
-            raise ValueError
-        length = float(found[1]) * METRES.get(found[2], 1.0)
-    except ValueError:
-        length = math.nan
-    if not 0.0 < length < math.inf:
-        raise click.BadParameter(f"{value!r} is not a length, 0.2mm say ({', '.join(METRES)})", context, parameter)
-    return length
+    number, unit = measured(context, parameter, value)
+    if not 0.0 < number < math.inf:
+        raise click.BadParameter(f"{value!r} is not a length > 0", context, parameter)
+    return number * (unit or 1.0)
 
 
 def building(command: Command) -> Command:

@@ -406,8 +406,9 @@ def _around(pixels: np.ndarray) -> np.ndarray:
     """Return the sums over each pixel of (h, w, n) and its neighbours, two to each side."""
     height, width, _ = pixels.shape
     pixels = np.pad(pixels, ((2, 2), (2, 2), (0, 0)))
-    rows = sum(pixels[k : k + height] for k in range(5))
-    return np.asarray(sum(rows[:, k : k + width] for k in range(5)))
+    rows = np.sum([pixels[k : k + height] for k in range(5)], axis=0)
+    summed: np.ndarray = np.sum([rows[:, k : k + width] for k in range(5)], axis=0)
+    return summed
 
 
 @dataclass(frozen=True)
