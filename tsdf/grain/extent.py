@@ -10,11 +10,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from tsdf.grain.simplex import lowest
+
 Floats = NDArray[np.float64]
 
 DIRECTIONS, TURNS = 300, 24  # from which the search for a sieve starts
 STARTS = 8  # of these, from which it goes on
-TOLERANCE = {"xatol": 1e-7, "fatol": 1e-9}  # where a search ends [rad, R]
+TOLERANCE = {"near": 1e-7, "level": 1e-9}  # where a search ends [rad, R]
 BLOCK = 1024  # vertices whose distances to all are held at once
 ALIKE = 512  # directions whose extreme vertices stand for all where a search starts
 
@@ -46,8 +48,6 @@ def sieve(vertices: Floats) -> float:
     vertices : (n, 3) float64
         Of the body.
     """
-    from scipy.optimize import minimize
-
     few = _extremes(vertices)
     angles = np.arange(TURNS) * (0.5 * math.pi / TURNS)
     first = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(TURNS)])
@@ -62,7 +62,7 @@ def sieve(vertices: Floats) -> float:
         along = (_rotation(turn) @ start).T @ across
         return float((along.max(axis=1) - along.min(axis=1)).max())
 
-    ways = [_frame(d) for d in _hemisphere(DIRECTIONS)]
+    ways = _frames(_hemisphere(DIRECTIONS))
     found = np.array([needed(few @ way) for way in ways])
     best = np.argsort(found.min(axis=1))[:STARTS]
     least = math.inf
@@ -73,9 +73,7 @@ def sieve(vertices: Floats) -> float:
         while missed:
             across = np.ascontiguousarray(few.T)
             simplex = turn + size * np.vstack([np.zeros(3), np.eye(3)])
-            there = minimize(partial(hole, start=start, across=across), turn, method="Nelder-Mead",
-                             options={"initial_simplex": simplex, **TOLERANCE})  # fmt: skip
-            turn, narrowest = there.x, float(there.fun)
+            turn, narrowest = lowest(partial(hole, start=start, across=across), simplex, **TOLERANCE)
             size = 0.005
             along = vertices @ (_rotation(turn) @ start)
             width = float(np.ptp(along, axis=0).max())
@@ -88,11 +86,11 @@ def sieve(vertices: Floats) -> float:
     return least
 
 
-def _frame(d: Floats) -> Floats:
-    """Return a rotation (3, 3) whose last column is a unit direction."""
-    u = np.cross(d, np.eye(3)[np.abs(d).argmin()])
-    u /= np.linalg.norm(u)
-    return np.column_stack([u, np.cross(d, u), d])
+def _frames(d: Floats) -> Floats:
+    """Return rotations (n, 3, 3) whose last columns are unit directions (n, 3)."""
+    u = np.cross(d, np.eye(3)[np.abs(d).argmin(axis=1)])
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return np.stack([u, np.cross(d, u), d], axis=2)
 
 
 def _rotation(turn: Floats) -> Floats:
