@@ -190,10 +190,11 @@ def _command(name: str) -> Callable[[], None]:
     return run
 
 
+(
     accuracy, albedo, build, export, frontier, grains, info, merge, optics, packing, plan, plot, preview, render,
     stress, validate,
 ) = map(
     _command,
-    ("accuracy", "albedo", "build", "export", "frontier", "grains", "info", "merge", "optics", "packing", "plan", "plot",
-     "preview", "render", "stress", "validate"),
+    ("accuracy", "albedo", "build", "export", "frontier", "grains", "info", "merge", "optics", "packing", "plan",
+     "plot", "preview", "render", "stress", "validate"),
 )  # fmt: skip
