@@ -98,7 +98,7 @@ def main(
     if sum(stop is not None for stop in (spp, seconds, target_error)) > 1:
         raise UsageError("--spp, --seconds and --target-error each say when to stop: give one")
 
-    from tsdf.picture import image, leaping, render, world
+    from tsdf.picture import leaping, render, world
     from tsdf.plan import report, shot
     from tsdf.scene.scene import MAX_EXPLICIT, load, resized
     from tsdf.scene.specs import files_of
@@ -125,7 +125,6 @@ def main(
         made = world.build(choice.scene, choice.scene.render.level, leap=leap, progress=work.told)
         for note in (*(report.notes(choice.plan) if choice.plan else ()), *made.notes):
             work.progress.note(note)
-        image.prepare()
         work.told(0.0, "starting")
         picture = render.render(made, choice.spp, choice.seconds, choice.target_error, seed, threads, told, work.stop)
         if not picture.samples.any():
@@ -181,10 +180,10 @@ def summary(world: "World", picture: "Picture", out: Path) -> None:
     singles = world.scene.render.explicit_grains
     after = f" after {singles} explicit grains" if singles else ""
     state = "interrupted: holds" if picture.interrupted else "holds"
+    error = f"{picture.relative_error:.2g}" if math.isfinite(picture.relative_error) else "unknown"
     say(
-        f"{plain(out)}: {state} {held} samples per pixel, level {world.level}{after}, relative error "
-        f"{picture.relative_error:.2g}, {picture.seconds:.1f} s, {picture.events / max(picture.seconds, 1e-9):.3g} "
-        "grain events per second"
+        f"{plain(out)}: {state} {held} samples per pixel, level {world.level}{after}, relative error {error}, "
+        f"{picture.seconds:.1f} s, {picture.events / max(picture.seconds, 1e-9):.3g} grain events per second"
     )
     for line in media(world):
         say(line)

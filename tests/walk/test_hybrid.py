@@ -339,8 +339,12 @@ def test_what_is_said(heap: Scene, ball: Table) -> None:
     for level in CHAINS:
         with pytest.raises(SceneError, match=r"heap: \[\[medium\]\] 1 \(heap\): .*at most 0\.64"):
             world.build(asking(dense, 1), level)
-    notes = world.build(asking(heap, 1), "teleport").notes
-    assert any("explicit grains meet suns" in note for note in notes) and not any("mean cosine" in n for n in notes)
+    wide, small = (
+        world.build(asking(heap, 1, "grains", (SunLight((0.6, 0.0, 0.8), (1.0, 0.9, 0.7), angle),)), "teleport").notes
+        for angle in (40.0, 0.5)
+    )
+    assert any("explicit grains meet suns" in note for note in small)
+    assert not any("meet suns" in note or "mean cosine" in note for note in wide)
     sphere = load_grain("sphere")
     build = scatterometer.Build.start(sphere, Optics(1e9), Effort(2_000, memory=4))
     build.run(sphere, 1)

@@ -26,6 +26,7 @@ from tsdf.picture import image
 from tsdf.picture.footprint import met_by_pixel
 from tsdf.picture.leaping import GAMMA, checked, leaping
 from tsdf.picture.media import DARKEST, media_of, spectra_of
+from tsdf.picture.trust import MOST_VOV, kurtosis_of
 from tsdf.scene.levels import AUTO, LEVELS, Traits
 from tsdf.scene.medium import Component, VolumeParameters, free_path
 from tsdf.scene.scene import (
@@ -302,7 +303,8 @@ def build(
         media = media._replace(limit=int(min(max(limit, longest), MOST_EVENTS)))
     notes += _long_paths(scene, [0.0 if there else n for n, there in zip(met, deep, strict=True)])
     notes += said
-    if singles and scene.media and lights.sampled:
+    samples = scene.render.spp * scene.camera.width * scene.camera.height
+    if singles and scene.media and lights.sampled and kurtosis_of(lights) > MOST_VOV * samples:
         notes.append(
             f"{scene.name}: {f'level {level} meets' if traits.packed else 'explicit grains meet'} suns and small "
             "bright lights by chance alone: until many samples have, the picture is too dark and its variance does not "
