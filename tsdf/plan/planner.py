@@ -152,7 +152,7 @@ class _Planning:
         )
         made = Plan(
             self.asked, self.target, self.seconds, (chosen, *rest), far, (), tuple(lacking), tuple(self.notes),
-            self.spent, self.threads,
+            self.spent, self.threads, self.load,
         )  # fmt: skip
         return replace(made, why=why(made, self.bodies, self.footprint, self.coverage, str(self.reference)))
 
