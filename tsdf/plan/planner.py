@@ -45,6 +45,8 @@ CHECK = 0.1  # of the time for a look at what is chosen and was not seen
 NEAR = 3.0  # times as long as the best as a candidate may seem to take to be looked at again
 EVENT_S = (1.0e-6, 5.0e-6)  # [s] of one explicit grain, an exact sphere and one of facets, about
 MEETINGS = 30.0  # of lights that are met by chance alone, that a pilot is believed from on
+LEAST_PER_E = 2.0  # explicit grains of facets that bring texture down by e, at least
+TIE = 1.1  # times as long as the cheapest as it may take, of those the one with the least error is taken
 ALIKE = 0.2  # of the logarithm of an error, what two levels of teleportation may differ by
 BUSY = 1.5  # times as long as on processors that have nothing else to do, from which on it is said
 LEAST = 1e-4  # [1] of an error
@@ -403,10 +405,16 @@ class _Planning:
         if not k:
             return floor
         off = math.hypot(bias, bias_error)
-        left = math.exp(-k / min(PER_E, self.length))
+        left = math.exp(-k / min(self.per_e, self.length))
         texture = math.sqrt(max(floor.value**2 - off**2, 0.0)) * left
         value = math.hypot(texture, min(off, floor.value))
         return Belief(value, math.hypot(math.hypot(floor.error * left, FADING * texture), 0.5 * min(bias_error, value)))
+
+    @property
+    def per_e(self) -> float:
+        """How many grains bring texture down by e: spheres 4 (docs/hybrid.md), facets as many as forget a direction."""
+        forget = [max(LEAST_PER_E, 1.0 / max(1.0 - body.mean_cosine, 1e-9)) for body in self.bodies if not body.round]
+        return min([PER_E, *forget])
 
     @property
     def length(self) -> float:
@@ -458,7 +466,8 @@ class _Planning:
             return min(found, key=lambda p: math.hypot(p.floor.high, p.noise(limit)))
         if math.isinf(takes):
             return min(found, key=lambda p: p.floor.high)
-        return best
+        alike = [p for p in found if p.safe_seconds(self.target) <= TIE * takes]
+        return min(alike, key=lambda p: p.floor.high)
 
 
 def loaded(scene: Scene) -> tuple[Scene, list[Table]]:

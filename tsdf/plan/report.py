@@ -71,7 +71,7 @@ def _reason(plan: Plan, bodies: Sequence[Body], footprint: float, coverage: floa
     turn = chosen.variance * chosen.turn
     worse = [p for p in plan.predictions[1:] if p.variance * p.turn < turn and p.floor.high > 0.0]
     nearest = min(worse, key=lambda p: p.floor.value, default=None)
-    than = f"; {short(nearest)}, and would take less" if nearest is not None else "; nothing takes less"
+    than = f"; {short(nearest)}, and is faster to the same noise" if nearest is not None else "; nothing takes less"
     return f"because {where}; {short(chosen)}{than}"
 
 
