@@ -207,7 +207,8 @@ def turned_back(setting: Setting) -> Iterator[Measured]:
 
 ROWS = (
     Row("restart", GROUP, "ray restarts at a facet", "rays that meet the convex grain they leave", "%", 0.002, even),
-    Row("grazing-restart", GROUP, "the same, within half a degree of the facet", "as above", "%", 0.002, grazing),
+    Row("grazing-restart", GROUP, "the same, within half a degree of the facet",
+        "rays that meet the convex grain they leave", "%", 0.002, grazing),
     Row("far", GROUP, "grain 1e4 R from the origin", "rays inside that meet no other facet", "%", 0.002, far),
     Row("small", GROUP, "grain of 1e-6 scene units", "rays inside that meet no other facet", "%", 0.002, small),
     Row("vertices", GROUP, "rays aimed at vertices", "rays that get out between facets", "%", 0.002, vertices),
