@@ -204,13 +204,15 @@ ROWS = (
         "eta-102",
         "layer of 40 R, eta = 1.02",
         Case("nearly", 0.6, 40.0, times=2),
-        20.0,
-        FORGETFUL | {"teleport-memory": FORGETS},
+        6.0,
+        FORGETFUL,
         False,
     ),
-    _slab("facets-traced", "layer of 10 R of cubes, eta = 1.31", Case("cube", 0.6, 10.0), 4.0, quick=False),
+    _slab("facets-traced", "layer of 10 R of cubes, eta = 1.31", Case("cube", 0.6, 10.0), 4.0, {}, quick=False),
     _slab("bubbles", "layer of 10 R of bubbles, eta = .75", Case("bubble", 0.6, 10.0), 3.0, quick=False),
-    _slab("plates", "layer of 10 R of plates, half of which are missed", Case("plates", 0.6, 10.0), 4.0, quick=False),
+    _slab(
+        "plates", "layer of 10 R of plates, half of which are missed", Case("plates", 0.6, 10.0), 4.0, {}, quick=False
+    ),
     Row(
         "mirrors-bulk",
         GROUP,
