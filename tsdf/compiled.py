@@ -3,7 +3,8 @@
 numba's own cache knows a kernel by the text of its file, not by that of the kernels it calls, so an upgrade that
 changes only those would leave old code running. Here a kernel is known by its file and all that this imports of the
 package. Where neither the package nor the home can be written to (farms, containers), numba gives up; here the code is
-kept in a folder of /tmp that nobody else can write to, for it is read back as it is, or else not at all.
+kept in a folder of /tmp that nobody else can write to, for it is read back as it is, or else not at all. What is kept
+are kernels that Python calls; those that kernels call are parts of them (`njit`).
 """
 
 import contextlib
@@ -20,25 +21,71 @@ from typing import Any
 
 import numba
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba.core import caching, cgutils, cpu, event, types
+from numba.core import caching, cgutils, codegen, compiler, cpu, event, types
 from numba.extending import intrinsic
+from numba.np import linalg
 
 from tsdf.files import whole
+
+# Before its first kernel numba looks whether scipy has a BLAS, which takes .15 s to import. It has, and who multiplies
+# matrices in a kernel asks for it again.
+_ensure_blas, linalg.ensure_blas = linalg.ensure_blas, bool
+import numba.np.arraymath  # noqa: E402
+
+linalg.ensure_blas = _ensure_blas
 
 PACKAGE = Path(__file__).parent
 _IMPORTS = re.compile(r"^from tsdf((?:\.\w+)*) import\s+([^(\n]+|\([^)]*\))", re.MULTILINE)
 
 
+class _Part(codegen.JITCodeLibrary):
+    """Code of a kernel that others call: it is made fast, and made machine code, in theirs alone."""
+
+    @property
+    def codegen(self) -> Any:
+        return self
+
+    def set_env(self, name: str, environment: Any) -> None:
+        """Do nothing: no machine code asks for this environment."""
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """Return 0, which says that there is no machine code."""
+        self._ensure_finalized()
+        return 0
+
+    def _optimize_final_module(self) -> None:
+        """Leave it as it is, but for what numba does to each function before."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+
+class _Within(compiler.Compiler):
+    """numba's compiler, for a kernel that others call."""
+
+    def __init__(self, typing: Any, target: Any, library: Any, *others: Any) -> None:
+        super().__init__(typing, target, _Part(target.codegen(), "part"), *others)
+
+
 def njit(**options: Any) -> Callable[[Any], Any]:
-    """Return what ``numba.njit`` does for these options; `cache` is kept as this module says."""
+    """Return what ``numba.njit`` does for these options; `cache` is kept as this module says.
+
+    Kernels that others call are compiled for them once more, as parts: numba would link each with all that it calls,
+    make that fast and then machine code, and begin again in its callers, one layer after the other, which took twice as
+    long for all of them together.
+    """
     kept = options.pop("cache", False)
     if not hasattr(cpu.CPUTargetOptions, "_nrt"):  # not a public option: without it, all works, only slower
         options.pop("_nrt", None)
+    options["no_cfunc_wrapper"] = True
 
     def compiled(function: Any) -> Any:
         kernel = numba.njit(**options)(function)
-        template = kernel.get_call_template
-        kernel.get_call_template = lambda args, kws: template([_any(kind) for kind in args], kws)
+        inner: Any = options | {"pipeline_class": _Within, "no_cpython_wrapper": True}
+        kernel.part = part = cache(lambda: numba.njit(**inner)(function))
+        kernel.get_call_template = lambda args, kws: part().get_call_template([_any(kind) for kind in args], kws)
+        kernel.get_overload = lambda signature: part().get_overload(signature)
         if kept:
             with contextlib.suppress(RuntimeError):  # nowhere to keep it, which `_fallback` has said
                 kernel._cache = _Cache(function)
@@ -84,18 +131,28 @@ def imported(name: str) -> frozenset[str]:
     found, waiting = set(), [name]
     while waiting:
         one = waiting.pop()
-        if one in found or not _file(one).is_file():
+        if one in found or _text(one) is None:
             continue
         found.add(one)
-        for inside, names in _IMPORTS.findall(_file(one).read_text(encoding="utf-8")):
-            each = re.findall(r"(\w+)(?:\s+as\s+\w+)?\s*(?:,|\)|$)", names)
-            waiting += [inside[1:], *(f"{inside}.{word}".lstrip(".") for word in each)]
+        waiting += _named(one)
     return frozenset(found)
 
 
-def _file(name: str) -> Path:
-    """Return the file of a module of this name, whether there is one or not."""
-    return PACKAGE.joinpath(*name.split(".")).with_suffix(".py")
+@cache
+def _named(name: str) -> list[str]:
+    """Return what may be the modules that one imports of the package."""
+    named = []
+    for inside, names in _IMPORTS.findall((_text(name) or b"").decode()):
+        each = re.findall(r"(\w+)(?:\s+as\s+\w+)?\s*(?:,|\)|$)", names)
+        named += [inside[1:], *(f"{inside}.{word}".lstrip(".") for word in each)]
+    return named
+
+
+@cache
+def _text(name: str) -> bytes | None:
+    """Return the text of a module of this name, None if there is none."""
+    file = PACKAGE.joinpath(*name.split(".")).with_suffix(".py")
+    return file.read_bytes() if file.is_file() else None
 
 
 @cache
@@ -106,7 +163,7 @@ def stamp(name: str) -> str:
     """
     digest = hashlib.sha256()
     for one in sorted(imported(name) | imported("compiled") | imported("handle")):
-        digest.update(hashlib.sha256(_file(one).read_bytes()).digest())
+        digest.update(hashlib.sha256(_text(one) or b"").digest())
     return digest.hexdigest()
 
 
