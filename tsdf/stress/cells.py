@@ -229,7 +229,7 @@ class Setting:
         """Return the sphere that sends all light back from its surface."""
         return self.traced("sphere", 1e9)
 
-    def traced(self, name: str, eta: float, paths: int = 200_000, **parameters: float) -> Table:
+    def traced(self, name: str, eta: float, paths: int = 200_000, **parameters: Any) -> Table:
         """Return the table of a traced grain."""
 
         def make() -> Table:
