@@ -107,7 +107,7 @@ def measure(case: tuple[str, float, float, float], seconds: float, runs: int) ->
     """Return our frontier and the peers' numbers."""
     scene, notes = ours(*case), list[str]()
     truth = frontier._truth(scene, notes)
-    ways = frontier._possible(scene, candidates(grains=(0, 3)), truth, notes, lambda share, word: None)
+    ways = frontier._possible(scene, candidates(grains=(0, 3)), truth, notes, lambda *_: None, threading.Event())
     peers = []
     for name, level in PEERS.items():
         peer = Peer(Candidate(level), build(taken(scene, Candidate(level)), level), 0)
