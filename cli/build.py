@@ -240,7 +240,7 @@ def main(  # noqa: PLR0913 - an argument for each option
         if contradiction:
             raise UsageError(text)
 
-    from tsdf.make import scatterometer
+    from tsdf.make import scatterometer, tracer
 
     optics = optics_of(eta, material, wavelength_nm, fresnel, quiet)
     if quality is not None:
@@ -260,6 +260,8 @@ def main(  # noqa: PLR0913 - an argument for each option
 
     from tsdf.grain.grains import load_grain
 
+    if not exact:
+        tracer.ahead(load_grain("sphere"))  # machine code, while the grain is read
     shape = load_grain(grain, repair="any" if repair_any else repair, **settings)
     for text in shape.notes:
         note(text, quiet)

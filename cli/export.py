@@ -8,7 +8,7 @@ from click.core import ParameterSource
 
 from tsdf.cli import spectral
 from tsdf.cli.common import Tool, check_numbers, check_output, plain, write_text
-from tsdf.cli.sizes import colour_of, coloured, in_words, said, sized
+from tsdf.cli.sizes import colour_of, coloured, in_words, length, said, sized
 
 SPECTRAL = ("tartes", "snicar", "disort", "eradiate", "phase")  # `radiative` writes them
 MEDIA = ("pbrt", "blender", "openpbr", "materialx", "arnold", "karma", "csv", "npz")  # `loaders.export` writes them
@@ -68,8 +68,8 @@ def _check_numbers(
     help="Absorb as this material instead (ice, say, or a file as of tsdf-build --material); needs --unit.",
 )  # fmt: skip
 @click.option(
-    "--unit", type=float, metavar="METRES",
-    help="Length of the scene unit; only --material, X/mm and --ssa need it.",
+    "--unit", type=float, is_eager=True, metavar="METRES",
+    help="Length of the scene unit; only --material, X/mm and --ssa need it.  [default: that of a length like 0.5mm]",
 )  # fmt: skip
 @click.option(
     "--lobes", type=click.IntRange(1, 2),
@@ -80,7 +80,7 @@ def _check_numbers(
     help="Share of the light [1] that the number of bounces is to keep.",
 )  # fmt: skip
 @click.option(
-    "--thickness", type=float, metavar="L", help="Of the body in scene units, for the bounces.  [default: deep]"
+    "--thickness", callback=length, metavar="L", help="Of the body in scene units, for the bounces.  [default: deep]"
 )  # fmt: skip
 @click.option("--measure", is_flag=True, help="Render a slab of 40 R to find the error of point scatterers.")
 @click.option(

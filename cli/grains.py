@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
+from tsdf.cli.absorption import METRES
 from tsdf.cli.common import Tool, check_output, plain, say, shown_progress
 from tsdf.errors import TSDFError, UsageError
 
 if TYPE_CHECKING:
     from tsdf.grain.volumes import Parts, Solid
-
-METRES = {"nm": 1e-9, "um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 
 class Row(NamedTuple):

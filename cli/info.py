@@ -44,8 +44,12 @@ UNITS = {"mean_z": "R", "mean_r": "R", "mean_miss_chord": "R", "mean_path_length
 @sized
 @coloured
 @click.option(
-    "--unit", type=float, metavar="METRES", help="Length of the unit of --radius; X/mm (um, cm, m) and --ssa need it."
-)
+    "--unit",
+    type=float,
+    is_eager=True,
+    metavar="METRES",
+    help="Length of the unit of --radius; X/mm (um, cm, m) and --ssa need it.  [default: of a length like 0.5mm]",
+)  # fmt: skip
 @click.option(
     "--render-colour",
     "level",

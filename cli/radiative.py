@@ -57,9 +57,8 @@ def export(files: tuple[str, ...], to: str, said: Said) -> None:
     lengths = {name: words[name] * (1.0 if name == "ssa" else metres) for name in words
                if name in (*spectral.LENGTHS, "ssa")}  # fmt: skip
     wavelengths = SNICAR if to == "snicar" else said.wavelength_nm or "300:2500:10"
-    material = said.material or "ice"
     given = dict.fromkeys((*spectral.LENGTHS, "ssa")) | lengths | {
-        "material": material, "wavelength_nm": wavelengths, **said.building,
+        "material": said.material, "wavelength_nm": wavelengths, **said.building,
     }  # fmt: skip
     asked = spectral.Asked.of(files, given)
     single = to in MONOCHROME and said.material is None and said.wavelength_nm is None and asked.tabulated

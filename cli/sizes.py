@@ -3,12 +3,15 @@
 docs/sizes.md defines them. Colours of deep media, which stand where absorption is asked for, are here, too.
 """
 
+import contextlib
 import math
+import re
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from tsdf.cli.absorption import METRES
 from tsdf.cli.common import plain
 from tsdf.errors import UsageError
 
@@ -20,7 +23,7 @@ OPTIONS = {  # word: option, unit, meaning
     "packing_fraction": ("--packing", "F", "Share of space in bounding spheres [1], at most 0.74."),
     "solid_fraction": ("--solid-fraction", "F", "Instead: share of space in the grains' material [1]."),
     "density": ("--density", "KG/M3", "Instead: mass over volume of the packed grains."),
-    "radius": ("--radius", "L", "Bounding radius of the grains; lengths are in its unit."),
+    "radius": ("--radius", "L", "Bounding radius of the grains, 0.5mm say; lengths are in its unit."),
     "effective_radius": (
         "--effective-radius",
         "L",
@@ -34,17 +37,43 @@ OPTIONS = {  # word: option, unit, meaning
 }
 
 
+def length(context: click.Context, parameter: click.Parameter, value: str | None) -> float | None:
+    """Read a length in the unit of --unit, or with one of its own, 0.5mm say, which --unit then is unless it is given.
+
+    So --unit must be eager.
+    """
+    if value is None:
+        return None
+    number, metres = measured(context, parameter, value)
+    if metres is None:
+        return number
+    if context.params.get("unit") is None:
+        context.params["unit"] = metres
+    unit = context.params["unit"]
+    return number * (metres / unit) if unit > 0.0 else number  # else it is refused
+
+
+def measured(context: click.Context, parameter: click.Parameter, value: str) -> tuple[float, float | None]:
+    """Return the number of a length, and its unit [m], None where it names none."""
+    found = re.fullmatch(r"\s*([-+.0-9eE]+|[-+]?(?:nan|inf))\s*([a-z]*)\s*", value)
+    if found is not None and found[2] in ("", *METRES):
+        with contextlib.suppress(ValueError):
+            return float(found[1]), METRES.get(found[2])
+    raise click.BadParameter(f"{value!r} is not a length, 0.2mm say ({', '.join(METRES)})", context, parameter)
+
+
 def sized(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the options of sizes and amounts, each under the name of its word."""
     for word, (option, unit, meaning) in reversed(OPTIONS.items()):
-        command = click.option(option, word, type=float, metavar=unit, help=meaning)(command)
+        kind: dict[str, Any] = {"callback": length} if unit == "L" else {"type": float}
+        command = click.option(option, word, metavar=unit, help=meaning, **kind)(command)
     return command
 
 
 def coloured(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the options of a colour: `deep_colour` and `colour_thickness`."""
     command = click.option(
-        "--colour-thickness", type=float, metavar="L",
+        "--colour-thickness", callback=length, metavar="L",
         help="Of the slab with nothing behind it that has the colour, in units of --radius.  [default: deep]",
     )(command)  # fmt: skip
     return click.option(

@@ -5,16 +5,14 @@ import io
 import json
 import math
 import os
-import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from tsdf.cli.absorption import METRES
-from tsdf.cli.common import check_output, say, setting, whole_number
-from tsdf.cli.sizes import by_option
+from tsdf.cli.common import check_output, plain, say, setting, whole_number
+from tsdf.cli.sizes import by_option, measured
 from tsdf.errors import UsageError
 
 if TYPE_CHECKING:
@@ -34,16 +32,10 @@ def metres(context: click.Context, parameter: click.Parameter, value: str | None
     """Read a length, "0.2mm" say; without a unit it is in metres."""
     if value is None:
         return None
-    found = re.fullmatch(r"\s*([-+.0-9eE]+)\s*([a-z]*)\s*", value)
-    try:
-        if found is None or found[2] not in ("", *METRES):
-            raise ValueError
-        length = float(found[1]) * METRES.get(found[2], 1.0)
-    except ValueError:
-        length = math.nan
-    if not 0.0 < length < math.inf:
-        raise click.BadParameter(f"{value!r} is not a length, 0.2mm say ({', '.join(METRES)})", context, parameter)
-    return length
+    number, unit = measured(context, parameter, value)
+    if not 0.0 < number < math.inf:
+        raise click.BadParameter(f"{value!r} is not a length > 0", context, parameter)
+    return number * (unit or 1.0)
 
 
 def building(command: Command) -> Command:
@@ -66,8 +58,9 @@ def options(command: Command) -> Command:
     for add in reversed(
         (
             click.argument("grains", nargs=-1, required=True, metavar="GRAIN|TABLE.."),
-            click.option("--material", default="ice", show_default=True, metavar="NAME|FILE",
-                         help="As of tsdf-build: ice, water, quartz, salt, glass, sucrose, or your own constants."),
+            click.option("--material", metavar="NAME|FILE",
+                         help="As of tsdf-build: ice, water, quartz, salt, glass, sucrose, or your own constants.  "
+                         "[default: that of the TABLE, else ice]"),
             click.option("--wavelength-nm", default="300:2500:10", show_default=True, metavar="FROM:TO:STEP|A,B,..",
                          help="Wavelengths [nm], ends included."),
             click.option("--radius", callback=metres, metavar="LENGTH", help="Bounding radius R, 0.5mm say."),
@@ -96,6 +89,28 @@ def is_table(name: str) -> bool:
     return name.lower().endswith(SUFFIX) or (name in names() and name not in BUILT_INS and not Path(name).exists())
 
 
+def own_material(tables: Sequence[str]) -> str:
+    """Return the material that tables are of; ice where they do not say one, as those of an index alone.
+
+    Raises
+    ------
+    UsageError
+        If they differ, or it is none of the built-in ones.
+    TSDFError
+        If one cannot be read.
+    """
+    from tsdf.data import format as tsdf_format
+    from tsdf.grain.materials import MATERIALS
+
+    found = {name: tsdf_format.read(name).header["optics"]["material"] for name in tables}
+    materials = sorted({material for material in found.values() if material is not None})
+    if len(materials) > 1:
+        raise UsageError(f"the tables are of {plain(' and '.join(materials))}: say --material")
+    if materials and materials[0] not in MATERIALS:
+        raise UsageError(f"the table is of {plain(materials[0])}, which is not built in: say --material NAME or FILE")
+    return str(materials[0]) if materials else "ice"
+
+
 class Asked(NamedTuple):
     """Options of `options`, but for those about output."""
 
@@ -119,7 +134,7 @@ class Asked(NamedTuple):
         if len(sizes) > 1:
             words = " and ".join("--" + name.replace("_", "-") for name in sizes)
             raise UsageError(f"{words} each say how large the grains are: give one")
-        tables = [grain.lower().endswith(SUFFIX) for grain in grains]
+        tables = [is_table(grain) for grain in grains]
         if any(tables) and not all(tables):
             raise UsageError("give one GRAIN, or tables of one grain (NAME.tsdf.exr), not both")
         if not any(tables) and len(grains) > 1:
@@ -127,7 +142,8 @@ class Asked(NamedTuple):
         if any(tables) and said["settings"]:
             raise UsageError("--set shapes a GRAIN that is built, not one whose tables are given")
         threads = said["threads"] or os.cpu_count() or 1
-        return cls(grains, said["material"], said["wavelength_nm"], sizes or dict([DEFAULT_SIZE]), said["settings"],
+        material = said["material"] or own_material(grains if all(tables) else ())
+        return cls(grains, material, said["wavelength_nm"], sizes or dict([DEFAULT_SIZE]), said["settings"],
                    said["table_paths"], threads)  # fmt: skip
 
     @property

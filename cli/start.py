@@ -30,6 +30,7 @@ HEAVY = (
     "tsdf-frontier",
     "tsdf-optics",
     "tsdf-packing",
+    "tsdf-plan",
     "tsdf-preview",
     "tsdf-render",
     "tsdf-stress",
@@ -190,10 +191,10 @@ def _command(name: str) -> Callable[[], None]:
 
 
 (
-    accuracy, albedo, build, export, frontier, grains, info, merge, optics, packing, plot, preview, render, stress,
-    validate,
+    accuracy, albedo, build, export, frontier, grains, info, merge, optics, packing, plan, plot, preview, render,
+    stress, validate,
 ) = map(
     _command,
-    ("accuracy", "albedo", "build", "export", "frontier", "grains", "info", "merge", "optics", "packing", "plot",
-     "preview", "render", "stress", "validate"),
+    ("accuracy", "albedo", "build", "export", "frontier", "grains", "info", "merge", "optics", "packing", "plan",
+     "plot", "preview", "render", "stress", "validate"),
 )  # fmt: skip

@@ -56,7 +56,6 @@ def level_of(picture: image.Image) -> str:
 
 def side_by_side(pictures: Sequence[Path], out: Path) -> list[tuple[str, Difference]]:
     """Write the plate of pictures as PNG and return the level of each but the first, and its difference to that."""
-    import colour
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -67,7 +66,7 @@ def side_by_side(pictures: Sequence[Path], out: Path) -> list[tuple[str, Differe
     FigureCanvasAgg(figure)
     top, bottom = figure.subplots(2, len(shown))
     for axes, one in zip(top, shown, strict=True):
-        axes.imshow(colour.cctf_encoding(np.clip(one.rgb.astype(np.float64), 0.0, 1.0)))
+        axes.imshow(image.encoded(one.rgb))
         axes.set_title(level_of(one))
     most = float(np.quantile([one.per_pixel for _, one in found], 0.99))
     for axes, (name, one) in zip(bottom[1:], found, strict=True):

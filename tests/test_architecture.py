@@ -15,7 +15,7 @@ PACKAGE = Path(tsdf.__file__).parent
 ROOT = PACKAGE.parent
 
 # Rooms in order: a module imports those of its own room and of the rooms before it. "" is the root.
-ROOMS = ["", "grain", "data", "judge", "make", "spheres", "scene", "walk", "picture", "study", "stress"]
+ROOMS = ["", "grain", "data", "judge", "make", "spheres", "scene", "walk", "picture", "study", "plan", "stress"]
 ROOT_MODULES = {"archive", "compiled", "errors", "files", "handle", "sampling", "vectors"}
 DOORS = {
     "numba": {"compiled", "handle"},

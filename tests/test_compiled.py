@@ -157,3 +157,14 @@ def test_what_is_fetched_is_what_it_was() -> None:
     for kind in (np.float32, np.float64):
         rows = np.arange(12.0).reshape(4, 3).astype(kind)
         assert summed(rows) == 18.0 and (rows == np.arange(12.0).reshape(4, 3)).all()
+
+
+def test_a_first_kernel_needs_no_scipy() -> None:
+    """numba imports scipy's linear algebra before any kernel, for .15 s; kernels that multiply matrices still do."""
+    code = (
+        "import sys, numpy as np\nfrom tsdf.compiled import njit\n"
+        "f = njit()(lambda x: x + 1.0)\nprint(f(1.0), 'scipy.linalg' in sys.modules)\n"
+        "g = njit()(lambda a: np.cov(a))\nprint(g(np.eye(2))[0, 1], 'scipy.linalg' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["2.0", "False", "-0.5", "True"]

@@ -83,10 +83,14 @@ def is_part(path: str | os.PathLike[str]) -> bool:
         if not stat.S_ISREG(os.stat(path).st_mode):
             return False
         with open(path, "rb") as file:
-            head = file.read(30 + len(PART) + 4)
+            return begins_part(file.read(64))
     except OSError:
         return False
-    return head[:4] == b"PK\x03\x04" and head[30:] == f"{PART}.npy".encode()
+
+
+def begins_part(data: bytes) -> bool:
+    """Return whether the bytes of a file begin as those of a part file do."""
+    return data[:4] == b"PK\x03\x04" and data[30:].startswith(f"{PART}.npy".encode())
 
 
 def _array(data: bytes) -> np.ndarray:

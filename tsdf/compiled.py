@@ -23,8 +23,16 @@ import numba
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import caching, cgutils, codegen, compiler, cpu, event, types
 from numba.extending import intrinsic
+from numba.np import linalg
 
 from tsdf.files import whole
+
+# Before its first kernel numba looks whether scipy has a BLAS, which takes .15 s to import. It has, and who multiplies
+# matrices in a kernel asks for it again.
+_ensure_blas, linalg.ensure_blas = linalg.ensure_blas, bool
+import numba.np.arraymath  # noqa: E402
+
+linalg.ensure_blas = _ensure_blas
 
 PACKAGE = Path(__file__).parent
 _IMPORTS = re.compile(r"^from tsdf((?:\.\w+)*) import\s+([^(\n]+|\([^)]*\))", re.MULTILINE)
@@ -123,18 +131,28 @@ def imported(name: str) -> frozenset[str]:
     found, waiting = set(), [name]
     while waiting:
         one = waiting.pop()
-        if one in found or not _file(one).is_file():
+        if one in found or _text(one) is None:
             continue
         found.add(one)
-        for inside, names in _IMPORTS.findall(_file(one).read_text(encoding="utf-8")):
-            each = re.findall(r"(\w+)(?:\s+as\s+\w+)?\s*(?:,|\)|$)", names)
-            waiting += [inside[1:], *(f"{inside}.{word}".lstrip(".") for word in each)]
+        waiting += _named(one)
     return frozenset(found)
 
 
-def _file(name: str) -> Path:
-    """Return the file of a module of this name, whether there is one or not."""
-    return PACKAGE.joinpath(*name.split(".")).with_suffix(".py")
+@cache
+def _named(name: str) -> list[str]:
+    """Return what may be the modules that one imports of the package."""
+    named = []
+    for inside, names in _IMPORTS.findall((_text(name) or b"").decode()):
+        each = re.findall(r"(\w+)(?:\s+as\s+\w+)?\s*(?:,|\)|$)", names)
+        named += [inside[1:], *(f"{inside}.{word}".lstrip(".") for word in each)]
+    return named
+
+
+@cache
+def _text(name: str) -> bytes | None:
+    """Return the text of a module of this name, None if there is none."""
+    file = PACKAGE.joinpath(*name.split(".")).with_suffix(".py")
+    return file.read_bytes() if file.is_file() else None
 
 
 @cache
@@ -145,7 +163,7 @@ def stamp(name: str) -> str:
     """
     digest = hashlib.sha256()
     for one in sorted(imported(name) | imported("compiled") | imported("handle")):
-        digest.update(hashlib.sha256(_file(one).read_bytes()).digest())
+        digest.update(hashlib.sha256(_text(one) or b"").digest())
     return digest.hexdigest()
 
 

@@ -20,7 +20,9 @@ import tsdf
 from tsdf.cli import common
 from tsdf.cli.build import main as build
 from tsdf.cli.build import told
+from tsdf.cli.info import main as info
 from tsdf.cli.merge import main as merge
+from tsdf.cli.validate import main as validate
 from tsdf.make.scatterometer import Build
 
 FAST = ["--eta", "1.31", "--paths", "10000", "--quiet"]
@@ -209,6 +211,9 @@ def test_parts_and_merge(tmp_path: Path) -> None:
     result = CliRunner().invoke(merge, [parts[0], "--out", str(tmp_path / "x.exr")])
     assert result.exit_code == 1 and "missing" in one_line(result)
     assert not (tmp_path / "x.exr").exists()
+    for command in (info, validate):
+        result = CliRunner().invoke(command, [parts[0]])
+        assert result.exit_code == 1 and "a part of a build, of which tsdf-merge makes a table" in result.output
 
 
 @pytest.mark.slow

@@ -197,6 +197,24 @@ def test_medium_without_deflection():
 
 
 @pytest.mark.parametrize(
+    ("words", "same"),
+    [
+        (("--radius", "0.5mm"), ("--radius", "0.5", "--unit", "0.001")),
+        (("--unit", "1", "--sieve", "500um"), ("--sieve", "0.0005", "--unit", "1")),
+        (("--sieve", "500um", "--unit", "1"), ("--sieve", "0.0005", "--unit", "1")),
+        (
+            ("--radius", "1mm", "--colour-thickness", "4cm", "--deep-colour", ".5"),
+            ("--unit", "1e-3", "--radius", "1", "--colour-thickness", "40", "--deep-colour", ".5"),
+        ),
+    ],
+)
+def test_lengths_with_a_unit(words, same):
+    """A length that names its unit is converted to --unit, wherever that stands, or is what it says."""
+    said, by_hand = (run(info, SPHERE, "--packing", "0.5", "--json", *some).stdout for some in (words, same))
+    assert json.loads(said) == json.loads(by_hand)
+
+
+@pytest.mark.parametrize(
     ("options", "parts"),
     [
         (("--packing", "0.8"), ("--packing", "0.74")),
@@ -209,6 +227,9 @@ def test_medium_without_deflection():
         ),
         (("--ssa", "20"), ("--ssa", "--unit")),
         (("--radius", "1", "--sieve", "2"), ("--radius, --sieve", "give one")),
+        (("--radius", "1parsec"), ("--radius", "'1parsec' is not a length, 0.2mm say (nm, um, mm, cm, m, km)")),
+        (("--radius", "-1mm"), ("--radius", "not -1")),
+        (("--radius", "1mm", "--unit", "0"), ("--unit is a finite number > 0",)),
         (("--colour-thickness", "1"), ("--colour-thickness", "--deep-colour")),
         (("--deep-colour", "1,.5,.5"), ("--deep-colour 1,.5,.5", "not 1: without any absorption it is 1")),
         (("--deep-colour", "0"), ("--deep-colour", "not 0: grains reflect some light")),

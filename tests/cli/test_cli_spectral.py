@@ -127,3 +127,22 @@ def test_near_wavelengths_keep_their_columns(tmp_path: Path) -> None:
     out, near = tmp_path / "m.csv", "500.00001,500.00002"
     assert run(optics, CUBE, "--wavelength-nm", near, "--moments", out, "--orders", 2, "--quiet").exit_code == 0
     assert out.read_text().splitlines()[2] == "order,500.00001nm,500.00002nm"
+
+
+def test_tables_say_what_they_are_of(tmp_path: Path) -> None:
+    """Without --material the constants are those of the table's own; of an index alone, of ice as before; of two
+    materials, or of one that is not built in, they are asked for."""
+    files = {"quartz": tmp_path / "q.tsdf.exr", "salt": tmp_path / "s.tsdf.exr", "mine": tmp_path / "m.tsdf.exr"}
+    for name, path in files.items():
+        made = tsdf.build("sphere", tsdf.Optics(1.55, "un", name, 550.0), tsdf.Effort(cells=16))
+        tsdf.write(made, path)
+    some = ("--wavelength-nm", "500,600", "--quiet", "--json")
+
+    def material(*words: object) -> str:
+        return str(json.loads(run(optics, *words, *some).stdout)["material"])
+
+    assert material(files["quartz"]) == "quartz" and material(CUBE) == "ice" and material("glass-beads") == "glass"
+    assert material(files["quartz"], "--material", "salt") == "salt"
+    for words, said in ((("quartz", "salt"), "of quartz and salt: say --material"), (("mine",), "mine, which is not")):
+        result = run(optics, *(files[word] for word in words), *some)
+        assert result.exit_code == 2 and said in result.stderr and result.stderr.count("\n") == 1

@@ -18,7 +18,6 @@ from tsdf.grain.grains import (
     first_hit,
     grain_from_mesh,
     load_grain,
-    self_intersection_share,
 )
 from tsdf.grain.surface import ODDLY, _winding_numbers
 
@@ -195,7 +194,7 @@ def test_exact_sphere():
     grain = load_grain("sphere")
     assert (grain.kind, grain.convex, grain.bodies, grain.bounding_radius) == ("sphere", True, 1, 1.0)
     assert grain.area == 4 * np.pi and grain.volume == 4 * np.pi / 3 and len(grain.faces) == 0
-    assert self_intersection_share(grain) == 0
+    assert check_crossings(grain).share == 0
     with pytest.raises(GrainError, match="no triangle mesh"):
         embree_scene(grain)
 

@@ -10,7 +10,7 @@ from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.picture import render, world
-from tsdf.picture.render import Picture
+from tsdf.picture.render import BLOCK, FEW, Goal, Picture, Portion, Sums
 from tsdf.picture.trust import Moments, Trust, kurtosis_of
 from tsdf.scene.scene import Camera, GrainSpec, MediumSpec, Scene, Sphere, SunLight, SurfaceSpec
 from tsdf.walk.lights import compile_lights
@@ -137,3 +137,42 @@ def test_trust_is_the_same_for_any_threads(table: Table) -> None:
     found = [picture(table, "teleport", 5.0, 20, threads).trust for threads in (1, 2, 3)]
     assert len({(t.vov, t.slope, t.chance, t.pixels.tobytes()) for t in found if t is not None}) == 1
     assert picture(table, "teleport", 5.0, 1).trust is None
+
+
+def test_a_pixel_of_one_sample_has_a_variance() -> None:
+    """An interrupted pass: pixels with one sample have that of the samples around, 9 at a corner to 25, on the average
+    the true one where the picture is even and more where it is not; pixels with more keep their own; none is known of
+    pixels without a sample, nor of a single one."""
+    rng = np.random.default_rng(3)
+
+    def sums(height: int, width: int, slope: float, whole: int, first: int) -> Picture:
+        made = Sums(width, height)
+        values = rng.gamma(2.0, 1.0, (height * width, 3, 3)) + slope * np.arange(height * width)[:, None, None]
+        for number, pixels in ((1, whole), (2, first)):
+            made.add(Portion(0, pixels, number, 0), values[:pixels, number - 1 : 2 * number - 1])
+        return made.picture(np.zeros(6, np.int64), 1.0, True)
+
+    even, sloping = sums(100, 99, 0.0, 9900, 700), sums(100, 99, 0.1, 9900, 700)
+    assert (even.samples.ravel()[:700] == 3).all() and (even.samples.ravel()[700:] == 1).all()
+    assert even.variance.shape == (100, 99, 3) and np.isfinite(even.relative_error)
+    single = even.variance[10:]
+    assert single.mean() == pytest.approx(2.0, abs=4.0 * single.std() / math.sqrt(single[::5, ::5].size))
+    assert sloping.variance[10:].mean() > 2.0 * single.mean()
+    own = even.variance[:7]
+    assert own.mean() == pytest.approx(2.0 / 3.0, abs=4.0 * own.std() / math.sqrt(own.size))
+    begun = sums(10, 10, 0.0, 50, 0)
+    assert np.isfinite(begun.variance[:5]).all() and np.isinf(begun.variance[5:]).all()
+    assert begun.relative_error == math.inf and np.isinf(sums(1, 1, 0.0, 1, 0).variance).all()
+
+
+@pytest.mark.parametrize("goal", [Goal(10**6, None, None), Goal(None, 1e6, None), Goal(None, None, 1e-9)])
+@pytest.mark.parametrize("count", [1, 768, 10**6])
+def test_no_pixel_is_far_behind(goal: Goal, count: int) -> None:
+    """Whenever a picture is interrupted, pixels have half as many samples as others at least, once they have 16 or the
+    picture has 65,536; and yet a million samples of a pixel take few passes where they are not many in all."""
+    done, share, passes = 0, 0, 0
+    while done < 10**6 and (share := goal.following(done, share, 1e-3 * share, 0.0, count)) > 0:
+        if done > max(FEW, BLOCK // count):
+            assert share <= done
+        done, passes = done + share, passes + 1
+    assert done >= 10**6 and (count > 1 or passes <= 12)

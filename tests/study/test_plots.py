@@ -1,6 +1,7 @@
 """plots: pictures show what the table holds, at the true edges, and the same table gives the same bytes."""
 
 import json
+import math
 import subprocess
 import sys
 
@@ -125,3 +126,26 @@ def test_no_global_state():
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert json.loads(done.stdout) == [True, True]
+
+
+@pytest.mark.parametrize("layers", [[4.0], [4.0, 40.0]])
+def test_levels_stand_beside_each_other_where_there_is_one_place(layers: list[float]) -> None:
+    """tsdf-accuracy with one --layer and --packing: no mark hides another, and explicit's error has a band."""
+    levels = {"explicit": math.nan, "teleport-memory": 0.01, "teleport": 0.011, "volume": 0.012}
+    number = {"value": 1.0, "error": 0.01, "deviation_error": 0.01, "fraction": 0.5}
+    bulk = [
+        {**number, "quantity": quantity, "level": level, "deviation": deviation, "layer": math.nan, "albedo": math.nan}
+        for quantity in ("displacement", "time") for level, deviation in levels.items()
+    ]  # fmt: skip
+    slabs = [
+        {**row, "quantity": "reflectance", "layer": layer, "angle_deg": angle, "albedo": 1.0}
+        for row in bulk[:4] for layer in layers for angle in (0.0, 60.0)
+    ]  # fmt: skip
+    figure = plots.plot_accuracy(bulk + slabs, 0.5, "ball")
+    for axes, places, angles in ((figure.axes[0], 1, 1), (figure.axes[1], len(layers), 2)):
+        marks = [x for bars in axes.containers for x in bars.lines[0].get_xdata()]
+        assert len(marks) == 3 * places * angles
+        assert len(set(marks)) == (len(marks) if places == 1 else places)
+        assert axes.get_xlim()[0] < min(marks) and max(marks) < axes.get_xlim()[1]
+        assert np.ptp(axes.collections[0].get_paths()[0].vertices[:, 0]) > 0.0
+    assert [tick.get_text() for tick in figure.axes[1].get_xticklabels()] == [f"{layer:g}" for layer in layers]

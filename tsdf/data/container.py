@@ -30,6 +30,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from tsdf.archive import begins_part
 from tsdf.errors import Finding, FormatError, FormatWarning, TSDFError
 from tsdf.files import replacing
 
@@ -318,7 +319,8 @@ def _collect(findings: list[Finding], form: Format[Any], broken: Broken) -> bool
 def _attributes(data: bytes, header: str) -> tuple[dict[str, Attribute], int]:
     """Return the attributes of the EXR header by name, and where it ends; `header` is the one that holds the JSON."""
     if data[:4] != MAGIC:
-        raise FormatError("EXR_MAGIC", "not an OpenEXR file", "bytes 0")
+        part = " but a part of a build, of which tsdf-merge makes a table" if begins_part(data) else ""
+        raise FormatError("EXR_MAGIC", f"not an OpenEXR file{part}", "bytes 0")
     if len(data) < 8:
         raise FormatError("EXR_TRUNCATED", "the file ends too early", f"bytes {len(data)}")
     if data[4:8] != b"\2\0\0\0":

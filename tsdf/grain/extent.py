@@ -62,7 +62,7 @@ def sieve(vertices: Floats) -> float:
         along = (_rotation(turn) @ start).T @ across
         return float((along.max(axis=1) - along.min(axis=1)).max())
 
-    ways = [_frame(d) for d in _hemisphere(DIRECTIONS)]
+    ways = _frames(_hemisphere(DIRECTIONS))
     found = np.array([needed(few @ way) for way in ways])
     best = np.argsort(found.min(axis=1))[:STARTS]
     least = math.inf
@@ -88,11 +88,11 @@ def sieve(vertices: Floats) -> float:
     return least
 
 
-def _frame(d: Floats) -> Floats:
-    """Return a rotation (3, 3) whose last column is a unit direction."""
-    u = np.cross(d, np.eye(3)[np.abs(d).argmin()])
-    u /= np.linalg.norm(u)
-    return np.column_stack([u, np.cross(d, u), d])
+def _frames(d: Floats) -> Floats:
+    """Return rotations (n, 3, 3) whose last columns are unit directions (n, 3)."""
+    u = np.cross(d, np.eye(3)[np.abs(d).argmin(axis=1)])
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return np.stack([u, np.cross(d, u), d], axis=2)
 
 
 def _rotation(turn: Floats) -> Floats:

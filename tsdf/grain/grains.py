@@ -360,11 +360,6 @@ def first_hit(scene: Any, origins: ArrayLike, directions: ArrayLike) -> NDArray[
     return scene.run(start, along) if len(start) else np.empty(0, np.int32)
 
 
-def self_intersection_share(grain: Grain, rays: int = 200_000, seed: int = 0) -> float:
-    """Return the share of test rays that prove that the surface crosses itself; see `check_crossings`."""
-    return check_crossings(grain, rays, seed).share
-
-
 def check_crossings(grain: Grain, rays: int = 200_000, seed: int = 0) -> Crossings:
     """Return how straight rays cross the surface, which must be void, material, void, and so on to void.
 

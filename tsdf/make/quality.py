@@ -9,11 +9,10 @@ class Quality(NamedTuple):
     target_error: float  # total variation of p_theta [1]
     joint: int  # records per cell of theta
     memory: int  # records per cell of entry
-    purpose: str
 
 
 QUALITIES = {
-    "draft": Quality(0.02, 8, 32, "a first look"),
-    "good": Quality(0.005, 32, 64, "pictures"),
-    "final": Quality(0.0025, 64, 64, "measurements"),
+    "draft": Quality(0.02, 8, 32),  # a first look
+    "good": Quality(0.005, 32, 64),  # pictures
+    "final": Quality(0.0025, 64, 64),  # measurements
 }

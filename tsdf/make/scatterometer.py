@@ -33,6 +33,7 @@ from tsdf.make.origin import canonical_command, grain_header, printable
 from tsdf.make.pace import ROUND_S, Pace, Progress
 from tsdf.make.spans import CHUNK_MIN, Spans, beginning, chunks, joined, size, without
 from tsdf.make.tally import Tally
+from tsdf.make.tracer import ahead
 
 MAX_LEAK = 1e-4  # share of the light that may be lost or cut off before a grain is refused
 SAVE_S = 5.0  # [s] the least between two saves of a part file
@@ -98,6 +99,7 @@ class Build:
                 "use --fresnel un for meshes"
             )
         effort = effort.resolved()
+        ahead(grain)
         return cls(grain_header(grain), optics, effort, Tally(joint=effort.joint, memory=effort.memory))
 
     @property

@@ -11,11 +11,12 @@ directions at once (`FAN`). Every path has a random stream of its own, a functio
 paths may be traced in any order, batch and thread.
 """
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from threading import Event
+from threading import Event, Lock, Thread
 from typing import NamedTuple
 
 import numpy as np
@@ -300,9 +301,10 @@ def in_order(first: int, last: int) -> np.ndarray:
     return numbers[np.argsort(numbers % T.REPLICATES, kind="stable")]
 
 
-@lru_cache(maxsize=2)  # the threads of a build share it: the horizon takes about a second to find
 def surface_of(grain: Grain, plain: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return what the kernels ask of a grain's surface; of the exact sphere, one facet that says nothing.
+
+    It is found once for all threads that ask, for the horizon may take a second.
 
     Returns
     -------
@@ -314,6 +316,15 @@ def surface_of(grain: Grain, plain: bool) -> tuple[np.ndarray, np.ndarray, np.nd
     share : float
         Share of the light that comes in above the horizon.
     """
+    with _finding:
+        return _surface_of(grain, plain)
+
+
+_finding = Lock()
+
+
+@lru_cache(maxsize=2)
+def _surface_of(grain: Grain, plain: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     if grain.kind == "sphere":
         return np.zeros((1, 4)), np.zeros((1, 3)), np.zeros(1), 1.0
     corners = grain.vertices[grain.faces]
@@ -411,3 +422,16 @@ class Tracer:
             live = advance(self._task, self._rays[0], self._block, counts, live, prims)
             self._rays.reverse()
         return total
+
+
+def ahead(grain: Grain) -> None:
+    """Begin, in a thread beside what goes on here, to make ready what tracing a grain asks for: machine code, horizon.
+
+    What fails there fails again where it is needed.
+    """
+
+    def work() -> None:
+        with contextlib.suppress(Exception):
+            Tracer(grain, eta=1.5).trace(in_order(0, T.REPLICATES), Tally())
+
+    Thread(target=work).start()

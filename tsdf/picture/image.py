@@ -358,12 +358,12 @@ def _mend(rgb: np.ndarray, notes: list[str]) -> None:
 
 
 def encoded(rgb: npt.ArrayLike, exposure: float = 0.0) -> np.ndarray:
-    """Return an image as 8-bit sRGB, (h, w, 3) uint8; see `write_png`."""
-    colour = _colour()
+    """Return an image as 8-bit sRGB (IEC 61966-2-1), (h, w, 3) uint8; see `write_png`."""
     if not abs(exposure) <= MAX_EXPOSURE:
         raise UsageError(f"exposure must be -{MAX_EXPOSURE:g} to {MAX_EXPOSURE:g} stops, got {exposure}")
     linear = _pixels(rgb, "rgb").astype(np.float64) * 2.0**exposure
-    shown: np.ndarray = colour.cctf_encoding(np.clip(np.nan_to_num(linear), 0.0, 1.0), function="sRGB")
+    linear = np.clip(np.nan_to_num(linear), 0.0, 1.0)
+    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
     return np.rint(255.0 * shown).astype(np.uint8)
 
 
@@ -421,11 +421,6 @@ def spectral_weights(wavelengths: tuple[float, ...] | None = None) -> Spectrum:
     for array in (nodes, weight):
         array.flags.writeable = False
     return Spectrum(nodes, weight)
-
-
-def prepare() -> None:
-    """Import what `write_png` needs, which takes a second or more, so that it then writes at once."""
-    _colour()
 
 
 def _colour() -> Any:

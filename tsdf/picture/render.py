@@ -47,7 +47,8 @@ class Picture:
     rgb : (h, w, 3) float64
         Mean radiance, linear sRGB.
     variance : (h, w, 3) float64
-        Of that mean, estimated from the samples; infinite with fewer than two.
+        Of that mean, estimated from the samples; of a pixel that has one, from those of the pixels around it, too, with
+        what these differ; infinite with none, or where there is one in all.
     samples : (h, w) int64
         Samples of each pixel.
     events, rays : int
@@ -227,8 +228,9 @@ def render(
             f"{world.scene.name}: a camera looking at nothing: it sees neither a medium nor a surface; move its target"
         )
     return measure(
-        world, camera_of(world), camera.width, camera.height, spp, seconds, target_error, seed, threads, progress, stop
-    )
+        world, camera_of(world), camera.width, camera.height, spp, seconds, target_error, seed, threads, progress, stop,
+        world.met,
+    )  # fmt: skip
 
 
 def measure(
@@ -243,6 +245,7 @@ def measure(
     threads: int | None = None,
     progress: Callable[[float, str], None] | None = None,
     stop: threading.Event | None = None,
+    already: np.ndarray = transport.NOBODY,
 ) -> Picture:
     """Return the picture that any camera takes, as `render` does for the scene's own; of a parallel beam, say."""
     goal = Goal(spp, seconds, target_error)
@@ -260,7 +263,8 @@ def measure(
     def follow(block: Portion) -> np.ndarray:
         mine = free.pop()
         try:
-            return mine.follow(transport.Job(camera, block.pixel, block.number, block.sample, seed), block.pixels, halt)
+            job = transport.Job(camera, block.pixel, block.number, block.sample, seed, already)
+            return mine.follow(job, block.pixels, halt)
         finally:
             free.append(mine)
 
@@ -374,10 +378,15 @@ class Sums:
 
     def picture(self, counters: np.ndarray, seconds: float, interrupted: bool) -> Picture:
         """Return the picture so far; counters (4,) as in `Walkers`, seconds [s] that it took."""
-        n = np.maximum(self.samples, 1)[:, None]
-        mean = self.total / n
-        with np.errstate(invalid="ignore", divide="ignore"):
-            variance = np.where(n > 1, np.maximum(self.squares / n - mean**2, 0.0) / np.maximum(n - 1, 1), math.inf)
+        n = self.samples[:, None]
+        variance = _variance(self.total, self.squares, n)
+        if (single := self.samples == 1).any():  # as in a pass that was interrupted
+            total, squares, many = (
+                _around(part.reshape(*self.shape[:2], -1)).reshape(len(n), -1)[single]
+                for part in (self.total, self.squares, n)
+            )
+            variance[single] = many * _variance(total, squares, many)
+        mean = self.total / np.maximum(n, 1)
         return Picture(
             rgb=mean.reshape(self.shape),
             variance=variance.reshape(self.shape),
@@ -392,6 +401,21 @@ class Sums:
             interrupted=interrupted,
             trust=self.moments.trust(self.samples, self.shape[:2], self.kurtosis) if self.samples.max() > 1 else None,
         )
+
+
+def _variance(total: np.ndarray, squares: np.ndarray, n: np.ndarray) -> np.ndarray:
+    """Return the variance of the mean of n samples (pixels, 1) of these sums (pixels, 3); infinite below 2."""
+    many = np.maximum(n, 1)
+    return np.where(n > 1, np.maximum(squares / many - (total / many) ** 2, 0.0) / np.maximum(n - 1, 1), math.inf)
+
+
+def _around(pixels: np.ndarray) -> np.ndarray:
+    """Return the sums over each pixel of (h, w, n) and its neighbours, two to each side."""
+    height, width, _ = pixels.shape
+    pixels = np.pad(pixels, ((2, 2), (2, 2), (0, 0)))
+    rows = np.sum([pixels[k : k + height] for k in range(5)], axis=0)
+    summed: np.ndarray = np.sum([rows[:, k : k + width] for k in range(5)], axis=0)
+    return summed
 
 
 @dataclass(frozen=True)
@@ -421,7 +445,8 @@ class Goal:
 
         Each of `count` pixels has `done` of them after `spent` seconds; the last pass had `share` and `took` seconds.
         """
-        most = max(FEW, PARTS * BLOCK // count)
+        # after the first seconds an interrupt leaves no pixel with less than half the samples of another
+        most = max(FEW, min(PARTS * BLOCK // count, max(BLOCK // count, done)))
         if self.spp is not None:
             return min(most if share else 1, self.spp - done)
         if self.seconds is None:

@@ -158,7 +158,8 @@ def plot_accuracy(rows: Sequence[Mapping[str, Any]], fraction: float, title: str
         left.set_title("bulk: mean squared displacement per event")
         left.set_xlabel("packing fraction")
         left.set_ylabel("deviation from explicit [%]")
-        left.xaxis.set_major_locator(MaxNLocator(7))
+        if len({row["fraction"] for row in bulk}) > 1:
+            left.xaxis.set_major_locator(MaxNLocator(7))
         slabs = [row for row in rows if row["quantity"] == "reflectance" and row["fraction"] == fraction]
         clear = [row for row in slabs if row["albedo"] == 1.0]
         angles = sorted({row["angle_deg"] for row in clear})
@@ -190,18 +191,24 @@ def plot_accuracy(rows: Sequence[Mapping[str, Any]], fraction: float, title: str
 
 def _deviations(axes: Any, rows: Sequence[Mapping[str, Any]], over: str, styles: Mapping[Any, tuple[str, str]]) -> None:
     """Draw deviations from explicit [%] over a key of the rows, by level and, where `styles` has several, by angle; the
-    band is explicit's own error, the widest of them."""
+    band is explicit's own error, the widest of them. If there is one place, what stands there stands side by side."""
     own: dict[float, float] = {}
     for row in rows:
         if row["level"] == "explicit" and row["value"] > 0.0:
             own[row[over]] = max(own.get(row[over], 0.0), 100.0 * row["error"] / row["value"])
     places = sorted(own)
     band = np.array([own[place] for place in places])
+    alone = len({row[over] for row in rows}) == 1
+    if alone:
+        axes.set_xlim(0.7 * rows[0][over], 1.3 * rows[0][over])
+        axes.set_xticks([rows[0][over]], [f"{rows[0][over]:g}"])
+        places, band = [*axes.get_xlim()][: 2 * len(band)], np.tile(band, 2)
     axes.fill_between(places, -band, band, color=COLOURS["explicit"], alpha=BAND, linewidth=0)
     axes.axhline(0.0, color=COLOURS["explicit"], linewidth=0.8)
     axes.set_yscale("symlog", linthresh=LINEAR, linscale=0.8)
     shown = [3.0 * LINEAR]
-    for level, colour in COLOURS.items():
+    drawn = [level for level in COLOURS if any(row["level"] == level for row in rows)]
+    for k, level in enumerate(drawn):
         for angle, (line, fill) in styles.items():
             some = sorted(
                 (row for row in rows if row["level"] == level and (angle is None or row["angle_deg"] == angle)
@@ -209,9 +216,10 @@ def _deviations(axes: Any, rows: Sequence[Mapping[str, Any]], over: str, styles:
             )  # fmt: skip
             values = [100.0 * row["deviation"] for row in some]
             errors = [100.0 * row["error"] / max(row["value"], 1e-300) for row in some]
+            aside = 0.5 * (k + 0.5 * (fill == "none") - 0.5 * len(drawn)) / len(drawn) if alone else 0.0
             axes.errorbar(
-                [row[over] for row in some], values, errors, color=colour, linestyle=line, linewidth=1.2,
-                marker=MARKS.get(level, "o"), markersize=4.5, fillstyle=fill, capsize=2, elinewidth=0.8,
+                [row[over] * (1.0 + aside) for row in some], values, errors, color=COLOURS[level], linestyle=line,
+                linewidth=1.2, marker=MARKS.get(level, "o"), markersize=4.5, fillstyle=fill, capsize=2, elinewidth=0.8,
             )  # fmt: skip
             shown += [abs(value) + error for value, error in zip(values, errors, strict=True)]
     _percent_ticks(axes.yaxis, 1.25 * max(shown))

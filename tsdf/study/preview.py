@@ -183,7 +183,6 @@ def preview(
     """
     if not 0.0 < packing_fraction <= MAX:
         raise UsageError(f"a packing fraction is above 0 and at most {MAX:g}, not {packing_fraction:g}")
-    image.prepare()
     spec = GrainSpec(table, mesh=mesh, absorption=absorption)
     deep, grey = _deep(spec, table, metres_per_radius)
     traced = _traced(spec, table)

@@ -43,7 +43,6 @@ FAINT = 1e-6  # [1/R] an absorption coefficient for which free paths are taken
 CROSSINGS = 2  # that a path counts among the grains met: its way into the slab and out
 LONG = 512  # grains met between two times that a path may be given up
 APART = np.uint64(0x3C6EF372FE94F82B)  # from other uses of a walker's key
-SETS = 3  # tables at which paths are followed, at most
 
 
 @dataclass(frozen=True)

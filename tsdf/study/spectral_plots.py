@@ -9,7 +9,7 @@ from tsdf.study.plots import BAND, STYLE
 from tsdf.study.slabs import Albedo
 from tsdf.study.spectra import Spectrum
 
-BLUE, RED, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#555555"  # Okabe & Ito 2008
+BLUE, RED, GREY = "#0072b2", "#d55e00", "#555555"  # Okabe & Ito 2008
 
 
 def plot_spectrum(found: Spectrum, name: str) -> Any:
