@@ -2,7 +2,7 @@
 
 Cubes of absorbing grains in white light are measured as `tsdf-frontier` does, and so are Mitsuba's pictures of them,
 against the same truth: error against processor time of all threads. Each peer's picture is the mean of sixteen, whose
-spread is its noise. Roulette is off in ``volpath``, which is a third sooner without it.
+spread is its noise. Roulette is off in ``volpath``, which changes little here.
 Writes DIR/peers.md and peers.png: each point of a peer beside the least error of our candidates after the same time.
 
     python benchmarks/bench_peers.py --out bench
