@@ -128,7 +128,7 @@ def judge_sphere(gavel: Gavel, t: Subject) -> None:
         allowed = t.noise(name) + ROUNDING + t.dropped * lever.get(name, 2.0)
         gavel.near(code, f"/statistics/{name}", name, t.s[name], value, allowed)
     moments, errors = np.array(t.s["legendre_moments"]), np.array(t.se["legendre_moments"])
-    pointer, slack = "/statistics/legendre_moments", ROUNDING + 2.0 * t.dropped
+    pointer, slack = "/statistics/legendre_moments", np.full(len(moments), ROUNDING + 2.0 * t.dropped)
     if not t.exact:  # light within one fine cell counts as if spread over it, where P_l may have its greatest slope
         nearly, order = math.cos(FINE), np.arange(len(moments))
         ahead = _sphere_masses((-1.0, nearly, 1.0), t.eta, fresnel, False)[-1]
