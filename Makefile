@@ -42,6 +42,10 @@ tables: .venv/installed  ## build the tables that the scenes name, into demo/
 library: .venv/installed  ## make the ready tables of the package and their page again, to the same bytes
 	$(BIN)/python -m tsdf.reference_data.make_library
 
+stress: .venv/installed  ## measure where methods fail, and make docs/stress.md and its picture of it
+	$(BIN)/tsdf-stress --out stress
+	cp stress/stress.md stress/stress.svg docs/
+
 gallery: tables  ## the scenes large and the chart of errors, into gallery/; SECONDS=900 is the time for each picture
 	mkdir -p gallery
 	$(BIN)/tsdf-plot demo/snow.tsdf.exr --out gallery/snow.png
@@ -79,6 +83,14 @@ docs: .venv/installed  ## make the API reference, into reference/
 	$(BIN)/python docs/reference.py
 	@echo "open reference/index.html; docs/index.md lists all pages"
 
+frontier: .venv/installed  ## measure error against processor time in seven scenes, and of building, into frontier/; 40 minutes
+	mkdir -p frontier
+	$(BIN)/tsdf-frontier scenes/frontier/dilute.toml scenes/frontier/dense.toml scenes/frontier/thin.toml \
+		scenes/frontier/deep.toml scenes/frontier/close.toml scenes/frontier/mixture.toml scenes/frontier/buried.toml \
+		--out frontier $(if $(SECONDS),--seconds $(SECONDS))
+	$(BIN)/python benchmarks/bench_building.py sphere --out frontier
+	@echo "docs/frontier.md reads the charts aloud; benchmarks/bench_peers.py puts Mitsuba on them"
+
 bench: .venv/installed  ## measure speed and error side by side, into bench/
 	$(BIN)/python benchmarks/bench.py
 	$(BIN)/python benchmarks/bench_sampler.py
@@ -91,4 +103,4 @@ fuzz: .venv/installed  ## throw damaged and hostile files and signals at everyth
 	for name in $(FUZZERS); do \
 		$(BIN)/python fuzz/$$name.py $(if $(COUNT),--count $(COUNT)) --seed $(or $(SEED),0) || exit; done
 
-.PHONY: help install demo tables library gallery pictures test test-fast check docs bench fuzz
+.PHONY: help install demo tables library stress frontier gallery pictures test test-fast check docs bench fuzz

@@ -23,6 +23,7 @@ from tsdf.errors import TSDFError, UsageError
 from tsdf.scene import levels
 
 LEVELS = tuple(levels.LEVELS)
+AUTO = levels.AUTO
 F = TypeVar("F", bound=Callable[..., Any])
 MOST_THREADS = 1024
 EVERY_S = 60.0  # [s] between lines of progress where no terminal shows a bar

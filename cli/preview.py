@@ -25,7 +25,7 @@ QUALITY = "draft"
 @click.argument("grain", metavar="TABLE|GRAIN")
 @click.option(
     "--out", default="preview.png", show_default=True, type=click.Path(path_type=Path),
-    help="Picture to write, .png or .pdf.",
+    help="Picture to write, .png, .pdf or .svg.",
 )  # fmt: skip
 @click.option(
     "--material", metavar="NAME|FILE",

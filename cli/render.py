@@ -5,16 +5,41 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from tsdf.cli.common import LEVELS, Tool, check_numbers, check_output, plain, say, seed_option, threads_option, working
+from tsdf.cli.common import (
+    AUTO,
+    LEVELS,
+    Tool,
+    check_numbers,
+    check_output,
+    plain,
+    say,
+    seed_option,
+    threads_option,
+    working,
+)
 from tsdf.cli.start import interrupt_status
 
 if TYPE_CHECKING:
     from tsdf.picture.render import Picture
     from tsdf.picture.world import World
+
+
+def first_grains(
+    context: click.Context, parameter: click.Parameter, value: str | None
+) -> tuple[int, bool] | None:  # fmt: skip
+    """Read a number of grains, and whether it falls to 0 where a pixel covers more."""
+    if value is None:
+        return None
+    number, falls = (value[:-2], True) if value.endswith("-0") else (value, False)
+    if not number.isdecimal():
+        raise click.BadParameter(
+            f"it is a whole number, 0 for none, or one that falls, as 8-0, not {value!r}", context, parameter
+        )
+    return int(number), falls
 
 
 @click.command("tsdf-render", cls=Tool)
@@ -23,12 +48,20 @@ if TYPE_CHECKING:
     "--out", required=True, type=click.Path(path_type=Path),
     help="Picture to write, NAME.exr (linear RGB and the variance of each pixel); NAME.png is written beside it.",
 )  # fmt: skip
-@click.option("--level", type=click.Choice(LEVELS), help="How grains are modelled.  [default: the scene's]")
 @click.option(
-    "--explicit-grains", type=int, metavar="K",
-    help="Follow the first K grains from the camera one by one, then as the level does.  [default: the scene's]",
+    "--level", type=click.Choice((*LEVELS, AUTO)),
+    help="How grains are modelled; auto takes the cheapest whose error is 2 % (tsdf-plan).  "
+    "[default: the scene's, else auto]",
 )  # fmt: skip
-@click.option("--spp", type=int, metavar="N", help="Samples per pixel.  [default: the scene's]")
+@click.option(
+    "--explicit-grains", callback=first_grains, metavar="K|K-0",
+    help="Follow the first K grains from the camera one by one, then as the level does; K-0: so many where grains look "
+    "largest, and fewer where a pixel covers more.  [default: the scene's]",
+)  # fmt: skip
+@click.option(
+    "--spp", type=int, metavar="N",
+    help="Samples per pixel.  [default: the scene's, else 64, or with auto what the 2 % take]",
+)  # fmt: skip
 @click.option("--seconds", type=float, metavar="S", help="Stop after S seconds instead.")
 @click.option(
     "--target-error", type=float, metavar="E",
@@ -44,9 +77,9 @@ if TYPE_CHECKING:
 @threads_option
 @click.option("--quiet", is_flag=True, help="No progress bar, no summary.")
 def main(
-    scene: Path, out: Path, level: str | None, explicit_grains: int | None, spp: int | None, seconds: float | None,
-    target_error: float | None, seed: int | None, width: int | None, leap: float | None, threads: int | None,
-    quiet: bool,
+    scene: Path, out: Path, level: str | None, explicit_grains: tuple[int, bool] | None, spp: int | None,
+    seconds: float | None, target_error: float | None, seed: int | None, width: int | None, leap: float | None,
+    threads: int | None, quiet: bool,
 ) -> int:  # fmt: skip
     """Render the picture of SCENE, a TOML file.
 
@@ -59,8 +92,6 @@ def main(
     if out.suffix.lower() != ".exr":
         raise UsageError(f"--out {plain(out)}: is to end in .exr")
     check_numbers(seed, spp=spp, width=width, threads=threads)
-    if explicit_grains is not None and explicit_grains < 0:
-        raise UsageError(f"--explicit-grains is a whole number, 0 for none, not {explicit_grains}")
     for name, limit in (("--seconds", seconds), ("--target-error", target_error)):
         if limit is not None and not 0.0 < limit < float("inf"):
             raise UsageError(f"{name} is a finite number above 0, not {limit:g}")
@@ -68,6 +99,7 @@ def main(
         raise UsageError("--spp, --seconds and --target-error each say when to stop: give one")
 
     from tsdf.picture import leaping, render, world
+    from tsdf.plan import report, shot
     from tsdf.scene.scene import MAX_EXPLICIT, load, resized
     from tsdf.scene.specs import files_of
 
@@ -75,11 +107,11 @@ def main(
         leaping.checked(leap, "--leap")
     read = resized(load(scene), width)
     if explicit_grains is not None:
-        most = min(explicit_grains, MAX_EXPLICIT)  # no path meets so many
-        read = replace(read, render=replace(read.render, explicit_grains=most))
+        most = min(explicit_grains[0], MAX_EXPLICIT)  # no path meets so many
+        read = replace(read, render=replace(read.render, explicit_grains=most, fewer_far=explicit_grains[1]))
+    if leap is not None and (level or read.render.level) == AUTO:  # of whichever level can
+        read, leap = replace(read, render=replace(read.render, leap=leap)), None
     check_output(out, scene, *files_of(read), beside=[out.with_suffix(".png")])
-    if spp is None and seconds is None and target_error is None:
-        spp = read.render.spp
     seed = read.render.seed if seed is None else seed
 
     with working(quiet) as work:
@@ -89,15 +121,16 @@ def main(
             work.told(share, word)
 
         work.told(0.0, "reading the scene")
-        made = world.build(read, level or read.render.level, leap=leap, progress=work.told)
-        for note in made.notes:
+        choice = shot.chosen(read, level, spp, seconds, target_error, seed, threads, work.told)
+        made = world.build(choice.scene, choice.scene.render.level, leap=leap, progress=work.told)
+        for note in (*(report.notes(choice.plan) if choice.plan else ()), *made.notes):
             work.progress.note(note)
         work.told(0.0, "starting")
-        picture = render.render(made, spp, seconds, target_error, seed, threads, told, work.stop)
+        picture = render.render(made, choice.spp, choice.seconds, choice.target_error, seed, threads, told, work.stop)
         if not picture.samples.any():
             click.echo("interrupted before the first sample: nothing is written", err=True)
             return interrupt_status()
-        save(made, picture, seed, out)
+        save(made, picture, seed, out, report.chosen_facts(choice.plan) if choice.plan else None)
     if picture.trust is not None and picture.trust.doubt is not None:
         click.echo(f"warning: {picture.trust.doubt}", err=True)
     if not quiet or picture.interrupted:
@@ -105,7 +138,7 @@ def main(
     return interrupt_status() if picture.interrupted else 0
 
 
-def save(world: "World", picture: "Picture", seed: int, out: Path) -> None:
+def save(world: "World", picture: "Picture", seed: int, out: Path, chosen: dict[str, Any] | None = None) -> None:
     """Write the EXR, with what it was made by as the attribute ``tsdf_render``, and the PNG beside it."""
     from tsdf import files
     from tsdf.picture import image
@@ -125,6 +158,9 @@ def save(world: "World", picture: "Picture", seed: int, out: Path) -> None:
     }
     if singles := world.scene.render.explicit_grains:
         facts["explicit_grains"] = singles
+        facts["fewer_far"] = world.scene.render.fewer_far
+    if chosen is not None:
+        facts["chosen"] = chosen
     if picture.trust is not None:
         facts |= {
             "trusted": picture.trust.doubt is None,

@@ -73,7 +73,7 @@ def options(command: Command) -> Command:
             building,
             click.option("--json", "as_json", is_flag=True, help="Print one JSON object."),
             click.option("--csv", "csv_file", type=click.Path(path_type=Path), metavar="PATH", help="Write columns."),
-            click.option("--plot", type=click.Path(path_type=Path), metavar="PATH", help="Draw it, .png or .pdf."),
+            click.option("--plot", type=click.Path(path_type=Path), metavar="PATH", help="Chart, .png, .pdf or .svg."),
             click.option("--quiet", is_flag=True, help="No progress bar, no table."),
         )
     ):  # fmt: skip

@@ -27,11 +27,13 @@ HEAVY = (
     "tsdf-accuracy",
     "tsdf-albedo",
     "tsdf-build",
-    "tsdf-compare",
+    "tsdf-frontier",
     "tsdf-optics",
     "tsdf-packing",
+    "tsdf-plan",
     "tsdf-preview",
     "tsdf-render",
+    "tsdf-stress",
 )
 
 silent = False  # standard output was closed when the process began
@@ -188,8 +190,11 @@ def _command(name: str) -> Callable[[], None]:
     return run
 
 
-(accuracy, albedo, build, compare, export, grains, info, merge, optics, packing, plot, preview, render, validate) = map(
+(
+    accuracy, albedo, build, export, frontier, grains, info, merge, optics, packing, plan, plot, preview, render,
+    stress, validate,
+) = map(
     _command,
-    ("accuracy", "albedo", "build", "compare", "export", "grains", "info", "merge", "optics", "packing", "plot",
-     "preview", "render", "validate"),
+    ("accuracy", "albedo", "build", "export", "frontier", "grains", "info", "merge", "optics", "packing", "plan",
+     "plot", "preview", "render", "stress", "validate"),
 )  # fmt: skip

@@ -201,13 +201,15 @@ def trial(path: Path) -> str:
     """
     from tsdf.errors import TSDFError
     from tsdf.picture import render, world
+    from tsdf.scene.levels import AUTO
     from tsdf.scene.scene import load
 
     try:
         scene = load(path)
         media = tuple(replace(m, packing_spheres=min(m.packing_spheres, SPHERES)) for m in scene.media)
         camera = replace(scene.camera, width=SIDE, height=SIDE)
-        made = world.build(replace(scene, camera=camera, media=media), scene.render.level)
+        level = "teleport" if scene.render.level == AUTO else scene.render.level
+        made = world.build(replace(scene, camera=camera, media=media), level)
         picture = render.render(made, spp=1, threads=1, seed=scene.render.seed)
     except TSDFError as error:
         message = str(error)

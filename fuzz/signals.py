@@ -28,8 +28,8 @@ SCENE = ROOT / "tests" / "ball.toml"
 COMMANDS = {
     "accuracy": "cube.tsdf.exr --out folder --packing 0.1 --seconds 1000",
     "build": "cube --eta 1.31 --paths 1e9 --out new.exr",
-    "compare": "scene.toml --out folder --spp 1000",
     "export": "cube.tsdf.exr --to csv --packing 0.3 --radius 1 --out new.csv",
+    "frontier": "scene.toml --out folder --seconds 1000",
     "info": "cube.tsdf.exr",
     "merge": "part --out new.exr",
     "packing": "--out new.exr --spheres 20000",

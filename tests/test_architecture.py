@@ -16,7 +16,7 @@ PACKAGE = Path(tsdf.__file__).parent
 ROOT = PACKAGE.parent
 
 # Rooms in order: a module imports those of its own room and of the rooms before it. "" is the root.
-ROOMS = ["", "grain", "data", "judge", "make", "spheres", "scene", "walk", "picture", "study"]
+ROOMS = ["", "grain", "data", "judge", "make", "spheres", "scene", "walk", "picture", "study", "plan", "stress"]
 ROOT_MODULES = {"archive", "compiled", "errors", "files", "handle", "sampling", "vectors"}
 DOORS = {
     "numba": {"compiled", "handle"},
@@ -30,7 +30,7 @@ DOORS = {
     "PIL": {"image"},
     "skimage": {"volumes"},
     "tifffile": {"volumes"},
-    "matplotlib": {"plots", "spectral_plots"},
+    "matplotlib": {"plots", "frontier_plots", "spectral_plots"},
     "jsonschema": {"container"},
     "yaml": {"constants"},
 }

@@ -115,7 +115,32 @@ def test_numbers_written_down_are_numbers() -> None:
         return total + inner((0, 2), short[0], True)
 
     assert outer(2, np.array([3], np.int32)) == 4
-    assert len(inner.signatures) == 1
+    assert len(inner.part().signatures) == 1 and not inner.signatures
+
+
+def test_a_kernel_of_others_is_compiled_in_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No machine code of its own is made for it, it does what it does from Python, and its errors come out."""
+    emitted = []
+    finish = compiled.codegen.CPUCodeLibrary._finalize_final_module
+    monkeypatch.setattr(
+        compiled.codegen.CPUCodeLibrary, "_finalize_final_module", lambda own: (emitted.append(own.name), finish(own))
+    )
+
+    @njit(nogil=True)
+    def root(x):  # type: ignore[no-untyped-def]
+        if x < 0.0:
+            raise ValueError("below 0")
+        return x**0.5
+
+    @njit(nogil=True)
+    def twice(x):  # type: ignore[no-untyped-def]
+        return 2.0 * root(x) + root(x + 1.0)
+
+    assert twice(0.0) == 1.0 and len(root.part().signatures) == 1
+    assert any("twice" in name for name in emitted) and not any("root" in name for name in emitted)
+    with pytest.raises(ValueError, match="below 0"):
+        twice(-3.0)
+    assert root(4.0) == 2.0 and any("root" in name for name in emitted)
 
 
 def test_what_is_fetched_is_what_it_was() -> None:

@@ -39,7 +39,7 @@ def test_render_takes_scenes_of_all_kinds(tmp_path: Path, monkeypatch: pytest.Mo
     """A file, a dict and a scene give one picture; what is said of the scene holds unless it is said otherwise."""
     shutil.copy(CHECKS / "cube.tsdf.exr", tmp_path)
     monkeypatch.chdir(tmp_path)
-    Path("scene.toml").write_text(TEXT.replace("[render]", "[render]\nlevel = 'volume'").replace("spp = 3", "spp = 2"))
+    Path("scene.toml").write_text(TEXT.replace('level = "teleport"', 'level = "volume"').replace("spp = 3", "spp = 2"))
     whole = tsdf.render(SCENE)
     assert whole.rgb.shape == (8, 12, 3) and (whole.samples == 2).all() and whole.rgb.min() < 0.25
     for scene in ("scene.toml", Path("scene.toml"), tsdf.load_scene("scene.toml")):

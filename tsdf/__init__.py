@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from tsdf.grain.optics import Optics as Optics
     from tsdf.make.build import build as build
     from tsdf.make.effort import Effort as Effort
-    from tsdf.picture.shot import render as render
+    from tsdf.plan.shot import render as render
     from tsdf.scene.scene import load as load_scene
 
     __version__: str
@@ -42,7 +42,7 @@ _HOMES = {
     "load_grain": "grain.grains:load_grain",
     "load_scene": "scene.scene:load",
     "read": "data.format:read",
-    "render": "picture.shot:render",
+    "render": "plan.shot:render",
     "write": "data.format:write",
 }
 __all__ = [

@@ -3,7 +3,8 @@
 numba's own cache knows a kernel by the text of its file, not by that of the kernels it calls, so an upgrade that
 changes only those would leave old code running. Here a kernel is known by its file and all that this imports of the
 package. Where neither the package nor the home can be written to (farms, containers), numba gives up; here the code is
-kept in a folder of /tmp that nobody else can write to, for it is read back as it is, or else not at all.
+kept in a folder of /tmp that nobody else can write to, for it is read back as it is, or else not at all. What is kept
+are kernels that Python calls; those that kernels call are parts of them (`njit`).
 """
 
 import contextlib
@@ -20,7 +21,7 @@ from typing import Any
 
 import numba
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba.core import caching, cgutils, cpu, event, types
+from numba.core import caching, cgutils, codegen, compiler, cpu, event, types
 from numba.extending import intrinsic
 from numba.np import linalg
 
@@ -37,16 +38,54 @@ PACKAGE = Path(__file__).parent
 _IMPORTS = re.compile(r"^from tsdf((?:\.\w+)*) import\s+([^(\n]+|\([^)]*\))", re.MULTILINE)
 
 
+class _Part(codegen.JITCodeLibrary):
+    """Code of a kernel that others call: it is made fast, and made machine code, in theirs alone."""
+
+    @property
+    def codegen(self) -> Any:
+        return self
+
+    def set_env(self, name: str, environment: Any) -> None:
+        """Do nothing: no machine code asks for this environment."""
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """Return 0, which says that there is no machine code."""
+        self._ensure_finalized()
+        return 0
+
+    def _optimize_final_module(self) -> None:
+        """Leave it as it is, but for what numba does to each function before."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+
+class _Within(compiler.Compiler):
+    """numba's compiler, for a kernel that others call."""
+
+    def __init__(self, typing: Any, target: Any, library: Any, *others: Any) -> None:
+        super().__init__(typing, target, _Part(target.codegen(), "part"), *others)
+
+
 def njit(**options: Any) -> Callable[[Any], Any]:
-    """Return what ``numba.njit`` does for these options; `cache` is kept as this module says."""
+    """Return what ``numba.njit`` does for these options; `cache` is kept as this module says.
+
+    Kernels that others call are compiled for them once more, as parts: numba would link each with all that it calls,
+    make that fast and then machine code, and begin again in its callers, one layer after the other, which took twice as
+    long for all of them together.
+    """
     kept = options.pop("cache", False)
     if not hasattr(cpu.CPUTargetOptions, "_nrt"):  # not a public option: without it, all works, only slower
         options.pop("_nrt", None)
+    options["no_cfunc_wrapper"] = True
 
     def compiled(function: Any) -> Any:
         kernel = numba.njit(**options)(function)
-        template = kernel.get_call_template
-        kernel.get_call_template = lambda args, kws: template([_any(kind) for kind in args], kws)
+        inner: Any = options | {"pipeline_class": _Within, "no_cpython_wrapper": True}
+        kernel.part = part = cache(lambda: numba.njit(**inner)(function))
+        kernel.get_call_template = lambda args, kws: part().get_call_template([_any(kind) for kind in args], kws)
+        kernel.get_overload = lambda signature: part().get_overload(signature)
         if kept:
             with contextlib.suppress(RuntimeError):  # nowhere to keep it, which `_fallback` has said
                 kernel._cache = _Cache(function)

@@ -167,9 +167,9 @@ def test_inputs_stay(case: str, spelling: str, inputs: Path, monkeypatch: pytest
 FOLDERS = {  # what is read, and as what in a scene
     "accuracy, csv": ("accuracy.csv", None),
     "accuracy, png": ("accuracy.png", None),
-    "compare, scene": ("levels.csv", "scene"),
-    "compare, table": ("volume.exr", "table"),
-    "compare, mesh": ("reference.png", "mesh"),
+    "frontier, scene": ("s.csv", "scene"),
+    "frontier, table": ("s.png", "table"),
+    "frontier, mesh": ("s.json", "mesh"),
 }
 
 
@@ -243,9 +243,9 @@ def test_one_output_is_not_the_other(inputs: Path) -> None:
     assert result.exit_code == 2 and "same file" in result.stderr
 
 
-@pytest.mark.parametrize("command", ["compare", "accuracy"])
+@pytest.mark.parametrize("command", ["frontier", "accuracy"])
 def test_folders_that_cannot_be_made(command: str, inputs: Path) -> None:
-    read = scene(inputs, "s.toml") if command == "compare" else inputs / "table.exr"
+    read = scene(inputs, "s.toml") if command == "frontier" else inputs / "table.exr"
     for name, status, said in (("table.exr", 1, "cannot be made"), ("a\nb", 2, r"a\nb"), ("x" * 300, 1, "too long")):
         result = invoke(command, read, "--out", inputs / name)
         assert result.exit_code == status and said in result.stderr and result.stderr.count("\n") == 1

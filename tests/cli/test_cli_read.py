@@ -293,7 +293,7 @@ def test_validate_plot(tmp_path):
     assert run(validate, SPHERE, "--plot", out).exit_code == 0
     assert out.read_bytes().startswith(b"\x89PNG")
     fails(run(validate, SPHERE, CUBE, "--plot", out), 2, "--plot")
-    fails(run(validate, SPHERE, "--plot", tmp_path / "a.jpg"), 2, ".png or a .pdf")
+    fails(run(validate, SPHERE, "--plot", tmp_path / "a.jpg"), 2, ".png, .pdf or .svg")
     result = run(validate, tmp_path / "missing", "--plot", tmp_path / "b.png")
     assert result.exit_code == 1 and "no picture" in result.stderr and not (tmp_path / "b.png").exists()
 
@@ -308,7 +308,7 @@ def test_plot_writes_a_picture(tmp_path):
 
 
 def test_plot_refuses(tmp_path):
-    fails(run(plot, CUBE, "--out", "a.gif"), 2, ".png or a .pdf")
+    fails(run(plot, CUBE, "--out", "a.gif"), 2, ".png, .pdf or .svg")
     fails(run(plot, CUBE), 2, "--out")
     fails(run(plot, CUBE, "--out", tmp_path / "missing" / "a.png"), 1, "cannot write")
     assert list(tmp_path.iterdir()) == []

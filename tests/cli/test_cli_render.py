@@ -277,3 +277,37 @@ def test_a_reader_who_is_gone_costs_no_result(monkeypatch: pytest.MonkeyPatch) -
         patch.setattr(common.click, "echo", gone)
         progress(0.5, "word")
         progress.note("note")
+
+
+def test_level_auto(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scene without a level is planned: what is taken, why, and what fixes it is said once, and is in the file; the
+    command that is named makes the same picture. With a level nothing is planned."""
+    from tsdf.plan import planner
+
+    monkeypatch.setattr(planner, "SECONDS", 1.0)
+    monkeypatch.setattr(planner, "LEAST_PILOTS", 0.5)
+    (folder / "auto.toml").write_text(SCENE.replace('level = "teleport"\n', ""))
+    words = [str(folder / "auto.toml"), "--out", str(folder / "a.exr")]
+    result = CliRunner().invoke(main, words, prog_name="tsdf-render")
+    assert result.exit_code == 0, result.stderr
+    (line,) = (line for line in result.stderr.splitlines() if line.startswith("note: level auto: take "))
+    fixed = re.search(r"; (--level \S+( --explicit-grains \S+)?) fixes it$", line)
+    assert fixed is not None
+    said = facts(folder / "a.exr")
+    assert said["chosen"]["level"] == said["level"] and said["samples"] == [3, 3] and said["chosen"]["target"] == 0.02
+    monkeypatch.setattr(planner, "plan", lambda *_: pytest.fail("a plan is made"))
+    monkeypatch.setattr("tsdf.plan.shot.plan", lambda *_: pytest.fail("a plan is made"))
+    again = CliRunner().invoke(main, [*words[:2], str(folder / "b.exr"), *fixed[1].split(), "--quiet"])
+    assert again.exit_code == 0 and "level auto" not in again.stderr
+    np.testing.assert_array_equal(image.read_exr(folder / "b.exr").rgb, image.read_exr(folder / "a.exr").rgb)
+    assert "chosen" not in facts(folder / "b.exr")
+
+
+def test_fewer_far(folder: Path) -> None:
+    """K-0 is what a scene says with fewer_far = true, and not what K is."""
+    assert run(folder, "--explicit-grains", "3-0", out="f.exr").exit_code == 0
+    assert facts(folder / "f.exr")["fewer_far"] is True and facts(folder / "f.exr")["explicit_grains"] == 3
+    (folder / "far.toml").write_text(SCENE.replace("[render]", "[render]\nexplicit_grains = 3\nfewer_far = true"))
+    asked = CliRunner().invoke(main, [str(folder / "far.toml"), "--out", str(folder / "g.exr"), "--quiet"])
+    assert asked.exit_code == 0
+    np.testing.assert_array_equal(image.read_exr(folder / "f.exr").rgb, image.read_exr(folder / "g.exr").rgb)

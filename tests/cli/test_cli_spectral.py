@@ -83,7 +83,7 @@ def test_albedo_says_what_was_asked(tmp_path: Path) -> None:
         ((CUBE, "--ssa", 20, "--radius", "1mm"), 2, "each say how large"),
         ((CUBE, "--radius", "1 furlong"), 2, "is not a length"),
         ((CUBE, "--ssa", -1), 2, "ssa"),
-        ((CUBE, "--plot", "x.gif"), 2, "a .png or a .pdf"),
+        ((CUBE, "--plot", "x.gif"), 2, "a .png, .pdf or .svg"),
         ((CUBE, "--csv", CUBE), 2, "it is an input"),
         (("no-such.tsdf.exr",), 1, "no-such.tsdf.exr"),
         (("no-such-grain",), 1, "neither a file nor a built-in grain"),

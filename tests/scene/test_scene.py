@@ -197,7 +197,7 @@ def test_defaults(folder):
     """What may be left out has the value that the format says."""
     got = parse(small(), folder)
     assert got.camera == scene.Camera((0.0, -3.0, 1.0), (0.0, 0.0, 0.0), 4, 3, (0.0, 0.0, 1.0), 40.0, 0.0)
-    assert got.render == scene.Render("teleport", 64, 0)
+    assert got.render == scene.Render("auto", None, 0)
     assert got.lights[1].angular_diameter_deg == 0.53
     assert (got.lights[2].scale, got.lights[2].rotation_deg) == (1.0, 0.0)
     medium = got.media[0]
@@ -220,7 +220,7 @@ def test_the_smallest_scenes(folder):
     """A medium or a surface is enough; every level is a level; ends of ranges are inside."""
     for key in ("medium", "surface"):
         parse(edited(key, ...), folder)
-    for level in scene.LEVELS:
+    for level in (*scene.LEVELS, "auto"):
         assert parse(edited("render/level", level), folder).render.level == level
     for path, value in [
         ("medium/0/inside", "centres"),

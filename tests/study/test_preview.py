@@ -24,8 +24,8 @@ DUST = SNOW._replace(packing_fraction=0.1)
     [
         (0.1, 5.0, SNOW, "explicit", 0),
         (0.1, 50.0, MIRROR, "explicit", 0),
-        (0.1, 50.0, SNOW, "teleport-memory", 10),
-        (0.5, 50.0, SNOW, "teleport-memory", 8),
+        (0.1, 50.0, SNOW, "teleport-memory", 9),
+        (0.5, 50.0, SNOW, "teleport-memory", 7),
         (1.0, 50.0, SNOW, "teleport-memory", 0),
         (1.0, 50.0, MIRROR, "teleport-packed", 0),
         (2.0, 9.0, DUST, "teleport-memory", 0),
@@ -47,7 +47,7 @@ def test_a_table_without_records_is_drawn_at_what_it_has() -> None:
     table, cube = tsdf.read(CHECKS / "PHYSICS_CHORD.tsdf.exr"), tsdf.read(CHECKS / "cube_memory.tsdf.exr")
     assert not table.memory and cube.memory
     near = advise(0.1, 50.0, SNOW)
-    assert preview._drawable(near, cube, True) == ("teleport-memory", 10, "")
+    assert preview._drawable(near, cube, True) == ("teleport-memory", 9, "")
     assert preview._drawable(near, cube, False)[:2] == ("teleport-packed", 0)
     level, singles, why = preview._drawable(advise(2.0, 50.0, SNOW), table, True)
     assert (level, singles) == ("teleport", 0) and "--memory 64" in why

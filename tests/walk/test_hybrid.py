@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from tsdf.grain.optics import Optics
 from tsdf.handle import Handle
 from tsdf.make import scatterometer
 from tsdf.make.scatterometer import Effort
-from tsdf.picture import image, render, world
+from tsdf.picture import footprint, image, render, world
 from tsdf.picture.render import Picture, Walkers
 from tsdf.picture.world import World
 from tsdf.sampling import GOLDEN, key_of, mix
@@ -37,7 +38,7 @@ from tsdf.scene.scene import (
     SurfaceSpec,
 )
 from tsdf.spheres.packing import Packing, cells_of
-from tsdf.walk import explicit, hybrid, memory, transport
+from tsdf.walk import explicit, geometry, hybrid, memory, transport
 from tsdf.walk.walker import FLY, HANDED, MOST, UNKNOWN, WALKER
 
 CAMERA = Camera((0.0, -14.0, 6.0), (0.0, 0.0, 0.0), 12, 8)
@@ -386,3 +387,43 @@ def test_a_grain_of_a_file(tmp_path: Path, heap: Scene, monkeypatch: pytest.Monk
     (tmp_path / "scenes" / "rock.stl").unlink()
     with pytest.raises(SceneError, match=r"'rock\.stl' is neither built in nor a file beside the table or the scene"):
         world.build(scene, "explicit")
+
+
+# ---------------------------------------------------------------------------------------------- fewer far away
+
+
+def test_fewer_where_a_pixel_covers_more() -> None:
+    """All of them where grains look largest, none where there are none, and in between as many as leave the same error:
+    4 ln 2 fewer, floored, where the texture is half."""
+    slab = MediumSpec(Slab(-50.0, 0.0), 0.5, 1.0, (GrainSpec(Path("none")),))
+    camera = Camera((0.0, -10.0, 8.0), (0.0, 40.0, 0.0), 64, 48, fov_deg=70.0)
+    scene = Scene(camera, (WHITE,), (slab,))
+    place = geometry.place(scene)
+    made = SimpleNamespace(scene=scene, place=place)
+    seen = footprint.footprints(scene, place, world.camera_of(made))
+    met = footprint.met_by_pixel(scene, place, world.camera_of(made), 8).reshape(48, 64)
+    assert np.isinf(seen[0]).all() and (met[0] == 8).all() and np.isfinite(seen[-1]).all()
+    row = seen[:, 32]
+    pixel = 2.0 * math.tan(math.radians(35.0)) / 64
+    down = math.atan2(8.0, 50.0)
+    ahead = 1.0 / (math.sin(down) + math.cos(down) * pixel * 23.5)  # to the last row, along the view, of a height
+    assert row[-1] == pytest.approx(pixel * 8.0 * ahead, rel=1e-6)
+    assert met[-1].min() == 0 and (np.diff(met[:, 32]) <= 0).all() and len(np.unique(met)) > 3
+    half = np.argmin(abs(footprint.texture(row) - 0.5 * footprint.texture(row[-1])))
+    assert abs(met[half, 32] - 4.0 * math.log(2.0)) <= 1.0
+
+
+@pytest.mark.parametrize("level", ["teleport-memory", "teleport"])
+def test_pixels_with_fewer(heap: Scene, level: str) -> None:
+    """A pixel that counts all grains as met is the chain's, one that counts none the hybrid's, to the last bit, side by
+    side in one picture; and a scene that asks for fewer far away is neither."""
+    chain, first = picture(asking(heap, 0), level), picture(asking(heap, 3), level)
+    made = world.build(asking(heap, 3), level)
+    count = heap.camera.width * heap.camera.height
+    made.met = np.where(np.arange(count) % 2 == 0, 3, 0)
+    mixed = render.render(made, 16, threads=2)
+    even = (np.arange(count) % 2 == 0).reshape(chain.rgb.shape[:2])
+    assert np.array_equal(mixed.rgb[even], chain.rgb[even]) and np.array_equal(mixed.rgb[~even], first.rgb[~even])
+    assert not np.array_equal(chain.rgb, first.rgb)
+    asked = asking(heap, 3)
+    assert len(world.build(replace(asked, render=replace(asked.render, fewer_far=True)), level).met) == count

@@ -10,13 +10,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from tsdf.grain.simplex import lowest
-
 Floats = NDArray[np.float64]
 
 DIRECTIONS, TURNS = 300, 24  # from which the search for a sieve starts
 STARTS = 8  # of these, from which it goes on
-TOLERANCE = {"near": 1e-7, "level": 1e-9}  # where a search ends [rad, R]
+TOLERANCE = {"xatol": 1e-7, "fatol": 1e-9}  # where a search ends [rad, R]
 MANY, NEAR = 4096, 0.1  # vertices of a body like a ball, and how near [R] they stand to the opposite, if few are asked
 BLOCK = 1024  # its square is how many distances are held at once
 ALIKE = 512  # directions whose extreme vertices stand for all where a search starts
@@ -63,6 +61,8 @@ def sieve(vertices: Floats) -> float:
     vertices : (n, 3) float64
         Of the body.
     """
+    from scipy.optimize import minimize
+
     few = _extremes(vertices)
     angles = np.arange(TURNS) * (0.5 * math.pi / TURNS)
     first = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(TURNS)])
@@ -88,7 +88,9 @@ def sieve(vertices: Floats) -> float:
         while missed:
             across = np.ascontiguousarray(few.T)
             simplex = turn + size * np.vstack([np.zeros(3), np.eye(3)])
-            turn, narrowest = lowest(partial(hole, start=start, across=across), simplex, **TOLERANCE)
+            there = minimize(partial(hole, start=start, across=across), turn, method="Nelder-Mead",
+                             options={"initial_simplex": simplex, **TOLERANCE})  # fmt: skip
+            turn, narrowest = there.x, float(there.fun)
             size = 0.005
             along = vertices @ (_rotation(turn) @ start)
             width = float(np.ptp(along, axis=0).max())

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from tsdf.grain.simplex import lowest
 from tsdf.judge import analytic
 from tsdf.make import tally as T
 from tsdf.make.statistics import each, product, ratio
@@ -106,6 +105,8 @@ def fits(p_theta: np.ndarray, edges: np.ndarray, mean_cosine: float) -> dict[str
     diffuses as far as with the table itself. Lobes have no atoms: those of the table count in the cells beside them,
     so that a lobe of g near 1 may stand for one.
     """
+    from scipy.optimize import minimize
+
     smeared = p_theta[1:-1].copy()
     smeared[0] += p_theta[0]
     smeared[-1] += p_theta[-1]
@@ -128,11 +129,13 @@ def fits(p_theta: np.ndarray, edges: np.ndarray, mean_cosine: float) -> dict[str
         return variation(weight * first + (1.0 - weight) * second)
 
     starts = [np.array((a, b)) for a in (-2.0, 0.0, 2.0, 8.0) for b in (-2.0, 0.0, 2.0)]
-    moved = [np.where(start != 0.0, 1.05 * start, 0.00025) for start in starts]
-    simplices = [np.vstack([start, [start[0], b], [a, start[1]]]) for start, (a, b) in zip(starts, moved, strict=True)]
-    best, least = min((lowest(both, corners, 1e-4, 1e-7) for corners in simplices), key=lambda found: found[1])
-    narrow, wide, weight = lobes(best)
+    options = {"xatol": 1e-4, "fatol": 1e-7, "maxiter": 400}
+    best = min(
+        (minimize(both, start, method="Nelder-Mead", options=options) for start in starts),
+        key=lambda result: result.fun,
+    )
+    narrow, wide, weight = lobes(best.x)
     return {
         "henyey_greenstein": {"g": g, "total_variation": variation(analytic.henyey_greenstein(g, edges))},
-        "two_lobe": {"g1": narrow, "g2": wide, "weight": weight, "total_variation": least},
+        "two_lobe": {"g1": narrow, "g2": wide, "weight": weight, "total_variation": float(best.fun)},
     }

@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -63,6 +63,8 @@ class Picture:
         How many of the events were not drawn one by one, and how many leaps stand for them.
     trust : Trust, optional
         Whether its variance is to be believed; None where there is no variance, or nobody has looked.
+    processor_seconds : float
+        Time that the processors spent on it, all threads together, and whatever else the process did meanwhile.
     """
 
     rgb: np.ndarray
@@ -77,6 +79,7 @@ class Picture:
     leapt: int = 0
     leaps: int = 0
     trust: Trust | None = None
+    processor_seconds: float = 0.0
 
     @property
     def relative_error(self) -> float:
@@ -225,8 +228,9 @@ def render(
             f"{world.scene.name}: a camera looking at nothing: it sees neither a medium nor a surface; move its target"
         )
     return measure(
-        world, camera_of(world), camera.width, camera.height, spp, seconds, target_error, seed, threads, progress, stop
-    )
+        world, camera_of(world), camera.width, camera.height, spp, seconds, target_error, seed, threads, progress, stop,
+        world.met,
+    )  # fmt: skip
 
 
 def measure(
@@ -241,6 +245,7 @@ def measure(
     threads: int | None = None,
     progress: Callable[[float, str], None] | None = None,
     stop: threading.Event | None = None,
+    already: np.ndarray = transport.NOBODY,
 ) -> Picture:
     """Return the picture that any camera takes, as `render` does for the scene's own; of a parallel beam, say."""
     goal = Goal(spp, seconds, target_error)
@@ -253,12 +258,13 @@ def measure(
     for walkers in pool:
         walkers.counters[:] = 0
     free = list(pool)
-    begin = time.perf_counter()
+    begin, worked = time.perf_counter(), time.process_time()
 
     def follow(block: Portion) -> np.ndarray:
         mine = free.pop()
         try:
-            return mine.follow(transport.Job(camera, block.pixel, block.number, block.sample, seed), block.pixels, halt)
+            job = transport.Job(camera, block.pixel, block.number, block.sample, seed, already)
+            return mine.follow(job, block.pixels, halt)
         finally:
             free.append(mine)
 
@@ -266,7 +272,8 @@ def measure(
         return time.perf_counter() - begin
 
     def picture(interrupted: bool) -> Picture:
-        return sums.picture(np.sum([walkers.counters for walkers in pool], axis=0), spent(), interrupted)
+        made = sums.picture(np.sum([walkers.counters for walkers in pool], axis=0), spent(), interrupted)
+        return replace(made, processor_seconds=time.process_time() - worked)
 
     done, share, took, reached = 0, 0, 0.0, math.inf
     with ThreadPoolExecutor(threads) as executor:

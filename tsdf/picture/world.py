@@ -9,7 +9,7 @@ neighbours are as well), teleport-packed (packed grains, answered by records), e
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import assert_never
 
 import numpy as np
@@ -23,10 +23,11 @@ from tsdf.grain.grains import first_hit, load_grain
 from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.picture import image
+from tsdf.picture.footprint import met_by_pixel
 from tsdf.picture.leaping import GAMMA, checked, leaping
 from tsdf.picture.media import DARKEST, media_of, spectra_of
 from tsdf.picture.trust import MOST_VOV, kurtosis_of
-from tsdf.scene.levels import LEVELS, Traits
+from tsdf.scene.levels import AUTO, LEVELS, Traits
 from tsdf.scene.medium import Component, VolumeParameters, free_path
 from tsdf.scene.scene import (
     Box,
@@ -45,11 +46,11 @@ from tsdf.spheres.packing_table import law
 from tsdf.vectors import frame
 from tsdf.walk.explicit import Packed, nothing_packed, packed
 from tsdf.walk.geometry import MESH, Place, Triangles, ball_hit, exact_hit, place
-from tsdf.walk.hybrid import hybrid_notes, singles_of
+from tsdf.walk.hybrid import ALL, hybrid_notes, singles_of
 from tsdf.walk.leaps import Leaps
 from tsdf.walk.lights import LightArrays, compile_lights
 from tsdf.walk.memory import Memory, memory_of
-from tsdf.walk.transport import CameraArrays
+from tsdf.walk.transport import NOBODY, CameraArrays
 from tsdf.walk.walker import MAX_EVENTS, Attenuation, Media
 
 CAPTIVES = 32  # paths that look for a way out from the camera
@@ -88,6 +89,8 @@ class World:
         What the user should know, one line each.
     sizes : tuple of InWords
         Of the media, in everybody's words.
+    met : (h * w,) int64
+        Of its explicit grains, how many a pixel counts as met before it begins; () where all have as many.
     """
 
     scene: Scene
@@ -106,6 +109,7 @@ class World:
     parameters: tuple[VolumeParameters, ...]
     notes: tuple[str, ...]
     sizes: tuple[InWords, ...]
+    met: np.ndarray = field(default_factory=lambda: NOBODY)
 
 
 def camera_of(world: World) -> CameraArrays:
@@ -221,7 +225,7 @@ def _triple(v: np.ndarray) -> tuple[float, float, float]:
 
 def build(
     scene: Scene, level: str, limit: int = MAX_EVENTS, leap: float | None = None,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Callable[[float, str], None] | None = None, places: dict[bool, Place] | None = None,
 ) -> World:  # fmt: skip
     """Return a scene ready to be rendered at a level.
 
@@ -236,6 +240,8 @@ def build(
         where the level leaps at all.
     progress : callable, optional
         Called with the share done and a word about it while records for leaps are made.
+    places : dict, optional
+        Geometry of the same scene, as far as it has been made, with and without single grains; it is added to.
 
     Raises
     ------
@@ -243,7 +249,8 @@ def build(
         In one line, for whatever makes the scene impossible at that level.
     """
     if level not in LEVELS:
-        raise SceneError(f"{scene.name}: no level {level!r}; levels are {', '.join(LEVELS)}")
+        hint = "; tsdf-plan chooses one" if level == AUTO else ""
+        raise SceneError(f"{scene.name}: no level {level!r}; levels are {', '.join(LEVELS)}{hint}")
     traits, singles = LEVELS[level].traits, singles_of(scene, level)
     gamma = _gamma(scene, level, leap)
     read: dict[str, Table] = {}
@@ -257,9 +264,16 @@ def build(
         return read[file]
 
     tables = [table_of(grain) for medium in scene.media for grain in medium.grains]
-    made = brim = place(scene, grains=traits.placed or singles > 0)
+    places = {} if places is None else places
+
+    def placed(grains: bool) -> Place:
+        if grains not in places:
+            places[grains] = place(scene, grains=grains)
+        return places[grains]
+
+    made = brim = placed(traits.placed or singles > 0)
     if not traits.placed and singles and any(medium.inside == "centres" for medium in scene.media):
-        brim = place(scene)
+        brim = placed(False)
     notes = list(made.notes)
     media, absorption, parameters = media_of(scene, traits, tables, limit)
     if records := LEVELS[level].records:
@@ -301,7 +315,7 @@ def build(
     grains = nothing_packed(len(scene.media), len(tables))
     if singles and scene.media:
         grains = packed(scene, tables, traced=not traits.answered)
-    return World(
+    ready = World(
         scene=scene,
         level=level,
         leap=gamma if any(deep) else 0.0,
@@ -319,6 +333,9 @@ def build(
         notes=(*notes, *grains.notes),
         sizes=tuple(_sizes(scene, tables)),
     )
+    if scene.render.fewer_far and 0 < singles < ALL:
+        ready.met = met_by_pixel(scene, made, camera_of(ready), singles)
+    return ready
 
 
 def _sizes(scene: Scene, tables: list[Table]) -> Iterator[InWords]:

@@ -103,6 +103,13 @@ def as_integer(low: int = 0, high: int = 2**63 - 1) -> Reader:
     return read
 
 
+def as_flag(value: Any, key: str, at: Place) -> bool:
+    """Read true or false."""
+    if not isinstance(value, bool):
+        at.fail(f"{key} must be true or false, not {shown(value)}")
+    return value
+
+
 def as_text(value: Any, key: str, at: Place) -> str:
     if not isinstance(value, str):
         at.fail(f"{key} must be text, not {shown(value)}")

@@ -58,6 +58,7 @@ class Level(NamedTuple):
     records: Records | None = None
 
 
+AUTO = "auto"  # no level, but whichever a plan takes
 BY_ENTRY = Records("memory", "records by entry", "--memory 64")
 LEVELS = {
     "explicit": Level(Traits(spheres=True, packed=True), "#000000", "s"),

@@ -40,6 +40,7 @@ from tsdf.scene.keys import (
     as_choice,
     as_colour,
     as_file,
+    as_flag,
     as_integer,
     as_name,
     as_number,
@@ -111,7 +112,7 @@ def load(path: str | os.PathLike[str]) -> Scene:
     >>> import tsdf
     >>> scene = tsdf.load_scene("heap.toml")
     >>> scene.media[0].packing_fraction, scene.render.level
-    (0.5, 'teleport')
+    (0.5, 'auto')
     """
     name = os.fspath(path)
     if name in library.names() and not os.path.exists(path):
@@ -459,7 +460,7 @@ def _leap(value: Any, key: str, at: Place) -> float:
 
 
 def _check_render(render: Render, at: Place) -> Render:
-    if render.leap and not levels.LEVELS[render.level].traits.leaps:
+    if render.leap and render.level != levels.AUTO and not levels.LEVELS[render.level].traits.leaps:
         at.fail(f"level {render.level} cannot leap, for its grains have their places; leave out leap, or say 0")
     return render
 
@@ -484,11 +485,12 @@ _SCENE = as_table(
         as_table(
             Render,
             _check_render,
-            level=as_choice(LEVELS),
+            level=as_choice((*LEVELS, levels.AUTO)),
             spp=as_integer(1, MAX_SAMPLES),
             seed=as_integer(),
             leap=_leap,
             explicit_grains=as_integer(0, MAX_EXPLICIT),
+            fewer_far=as_flag,
         )
     ),
     light=as_tables("[[light]]", _LIGHT, MAX_LIGHTS),

@@ -40,11 +40,12 @@ class Camera:
 class Render:
     """Defaults of the command line."""
 
-    level: str = "teleport"  # one of LEVELS
-    spp: int = 64  # samples per pixel
+    level: str = "auto"  # one of LEVELS, or whichever a plan takes
+    spp: int | None = None  # samples per pixel; None where it is not said
     seed: int = 0
     leap: float | None = None  # smallest leap [transport mean free paths], 0 for none; None where it is not said
     explicit_grains: int = 0  # met one by one, the first from the camera, before a chain of grains takes over
+    fewer_far: bool = False  # so many only where grains look largest, fewer where a pixel covers more of them
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,7 @@
 """Advice: which level a picture of grains should take, by a rule of four sizes, with its reasons.
 
+`plan` knows better, for it looks at the scene; this is for things that are not one yet, and shares its law of texture.
+
 Sizes are in bounding radii R: what a pixel covers, how thick the grains lie, how far light goes before it has forgotten
 its direction (the transport mean free path l*). Where the numbers come from: docs/rendering.md ("Which level?").
 """
@@ -7,6 +9,7 @@ its direction (the transport mean free path l*). Where the numbers come from: do
 import math
 from typing import NamedTuple
 
+from tsdf.picture.footprint import PER_E, texture
 from tsdf.spheres.packing import MAX
 from tsdf.walk.hybrid import LEAST_COSINE, LEAST_LAYER
 
@@ -15,8 +18,6 @@ THIN = 10.0  # [R] thinner layers are not told from their neighbours' places
 DEEP = 25.0  # [l*] thicker ones let 1 / (1 + 3/4 25) = .05 of the light through: a tenth of it is .005 of reflectance
 SPARSE = 0.3  # packing fraction up to which grains do not know of their neighbours
 TARGET = 0.05  # [1] error of a pixel that is borne
-TEXTURE, AT, MOST = 0.3, 0.5, 0.55  # [1] error without explicit grains where a pixel covers R/2, and of a ray
-PER_E = 4.0  # explicit grains that bring it down by e, docs/hybrid.md
 
 
 class Medium(NamedTuple):
@@ -54,7 +55,7 @@ def advise(footprint: float, thickness: float, medium: Medium) -> Advice:
     --------
     >>> snow = Medium(packing_fraction=0.5, transport=5.0, mean_cosine=0.6)
     >>> print(advise(0.5, 100.0, snow))
-    take level teleport-memory here, k = 8
+    take level teleport-memory here, k = 7
     >>> print(advise(5.0, 400.0, snow))
     take level volume here
     """
@@ -67,13 +68,13 @@ def advise(footprint: float, thickness: float, medium: Medium) -> Advice:
             return Advice("explicit", 0, f"{seen}, and {back}")
         if thickness - 2.0 <= LEAST_LAYER:
             return Advice("explicit", 0, f"{seen}, and {thickness:.2g} R are but a few of them")
-        texture = min(TEXTURE * math.sqrt(AT / footprint), MOST)
-        k = max(1, math.ceil(PER_E * math.log(texture / TARGET)))
+        missing = float(texture(footprint))
+        k = max(1, math.ceil(PER_E * math.log(missing / TARGET)))
         return Advice(
             chain,
             k,
-            f"{seen}; k = 4 ln({texture:.2g} / {TARGET:g}) explicit grains first (--explicit-grains {k}) bring the "
-            f"error of a pixel from {texture:.0%} to {TARGET:.0%}",
+            f"{seen}; k = 4 ln({missing:.2g} / {TARGET:g}) explicit grains first (--explicit-grains {k}) bring the "
+            f"error of a pixel from {missing:.0%} to {TARGET:.0%}",
         )
     deep = thickness / medium.transport
     if deep >= DEEP:

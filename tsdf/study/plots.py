@@ -22,7 +22,7 @@ from tsdf.judge.physics import ZHOU_ETA, reference
 from tsdf.scene.levels import LEVELS
 from tsdf.study.preview import Preview
 
-SUFFIXES = (".png", ".pdf")
+SUFFIXES = (".png", ".pdf", ".svg")
 DPI = 160
 DECADES = 3.0  # range of the colours below the largest density
 DENSEST = 1e30  # density shown; cells may be as narrow as numbers are
@@ -44,7 +44,7 @@ LINEAR = 1.0  # [%] deviations up to which an axis is linear, beyond it is logar
 
 
 def check_suffix(path: str | os.PathLike[str]) -> str:
-    """Return the format that a file name asks for, "png" or "pdf".
+    """Return the format that a file name asks for, "png", "pdf" or "svg".
 
     Raises
     ------
@@ -53,7 +53,9 @@ def check_suffix(path: str | os.PathLike[str]) -> str:
     """
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
-        raise UsageError(f"{os.fspath(path)}: a picture is a .png or a .pdf file, not {suffix or 'without suffix'!r}")
+        raise UsageError(
+            f"{os.fspath(path)}: a picture is a .png, .pdf or .svg file, not {suffix or 'without suffix'!r}"
+        )
     return suffix[1:]
 
 
@@ -68,7 +70,11 @@ def save(figure: Any, path: str | os.PathLike[str]) -> None:
     import matplotlib
 
     kind = check_suffix(path)
-    unstamped = {"png": {"Software": None}, "pdf": {"CreationDate": None, "Producer": None, "Creator": None}}
+    unstamped = {
+        "png": {"Software": None},
+        "pdf": {"CreationDate": None, "Producer": None, "Creator": None},
+        "svg": {"Date": None, "Creator": None},
+    }
     buffer = io.BytesIO()
     with matplotlib.rc_context(STYLE):
         figure.savefig(buffer, format=kind, dpi=DPI, metadata=unstamped[kind])
@@ -127,69 +133,6 @@ def plot_validation(table: Table) -> Any:
     return figure
 
 
-def plot_levels(rows: Sequence[Mapping[str, Any]], reference: str, title: str) -> Any:
-    """Return a matplotlib Figure of the model error of levels against the time they take to little noise.
-
-    Parameters
-    ----------
-    rows : sequence of dict
-        As of `compare.facts`: level, seconds_to_1_percent, and the relative errors rmse, rmse_low and rmse_high [1],
-        with rmse_seen 0 where rmse is a bound. The reference comes first; its rmse is its own noise.
-    reference : str
-        What the errors are to.
-    title : str
-    """
-    import matplotlib
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import LogFormatter
-
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(6.8, 4.4), layout="constrained")
-        axes = figure.subplots()
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        points = [row for row in rows if 0.0 < row["seconds_to_1_percent"] < math.inf and 0.0 < row["rmse"] < math.inf]
-        shown = [100.0 * row["rmse"] for row in points]
-        floor = 0.3 * min(shown, default=1.0)
-        words = []
-        for row, error in zip(points, shown, strict=True):
-            time = row["seconds_to_1_percent"]
-            style: Any = {"color": COLOURS[row["level"]], "markersize": 6}
-            if row is rows[0]:
-                axes.axhline(error, color=COLOURS[row["level"]], linestyle=":", linewidth=1.0)
-                axes.plot(time, error, "s", **style)
-                word = f"{row['level']} (its noise)"
-            elif row["rmse_seen"]:
-                low, high = 100.0 * row["rmse_low"], 100.0 * row["rmse_high"]
-                axes.errorbar(time, error, [[error - max(low, floor)], [high - error]], fmt="o", capsize=3, **style)
-                word = row["level"]
-            else:
-                axes.errorbar(time, error, 0.35 * error, fmt="_", uplims=True, **style)
-                word = f"{row['level']} (below)"
-            words.append(word)
-        if points:
-            times = [row["seconds_to_1_percent"] for row in points]
-            top = 2.0 * max(*shown, *(100.0 * row["rmse_high"] for row in points))
-            axes.set_xlim(min(times) / 1.6, max(times) * 1.6)
-            axes.set_ylim(floor, top)
-            height = -1.0
-            for k in np.argsort(shown):  # names stand beside the axes, pushed apart where points are close
-                height = max(math.log(shown[k] / floor) / math.log(top / floor), height + 0.055)
-                axes.annotate(
-                    _literal(words[k]), (times[k], shown[k]), (1.04, height), "data", "axes fraction", va="center",
-                    color=COLOURS[points[k]["level"]],
-                    arrowprops={"arrowstyle": "-", "color": COLOURS[points[k]["level"]], "linewidth": 0.4},
-                )  # fmt: skip
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_formatter("{x:g}")
-            axis.set_minor_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(2, 0.5)))
-        axes.grid(which="both", linewidth=0.3, alpha=0.5)
-        axes.set_xlabel("time to a relative standard error of 1 % per pixel [s]")
-        axes.set_ylabel(f"error of the model: RMSE to {reference}, noise taken off [%]")
-        axes.set_title(_literal(title))
-    return figure
-
-
 def plot_accuracy(rows: Sequence[Mapping[str, Any]], fraction: float, title: str) -> Any:
     """Return a matplotlib Figure of how far levels are from packed grains: in the bulk, in slabs, and against time.
 
@@ -241,7 +184,7 @@ def plot_accuracy(rows: Sequence[Mapping[str, Any]], fraction: float, title: str
             Line2D([], [], color="0.4", linestyle=line, marker="o", fillstyle=fill, label=f"at {angle:g}°", **style)
             for angle, (line, fill) in zip(angles, ANGLE_STYLES, strict=False)
         ]
-        figure.suptitle(f"{_literal(title)}: levels against packed grains, traced one by one", fontsize=10.5)
+        figure.suptitle(f"{literal(title)}: levels against packed grains, traced one by one", fontsize=10.5)
         figure.legend(handles=keys, loc="outside lower center", ncols=len(keys), frameon=False, handlelength=1.8)
     return figure
 
@@ -372,7 +315,7 @@ def _title(table: Table) -> str:
     grain, optics, error = header["grain"], header["optics"], header["table_error"]
     paths = header["provenance"]["paths"]
     made = f"{paths:,} paths" if paths else "quadrature"
-    name = _literal(grain["name"])
+    name = literal(grain["name"])
     total = error["total_variation"]
     return (
         f"{name}, $\\eta$ = {optics['eta']:.6g}, Fresnel {optics['fresnel']}, {made}\n"
@@ -380,7 +323,7 @@ def _title(table: Table) -> str:
     )
 
 
-def _literal(text: str) -> str:
+def literal(text: str) -> str:
     """Return text from a header as matplotlib shows it literally: no mathematics, one line, not too long."""
     text = text if text.isascii() and text.isprintable() else ascii(text)[1:-1]
     return (text if len(text) <= 40 else f"{text[:37]}...").replace("$", r"\$")

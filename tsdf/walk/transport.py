@@ -15,6 +15,8 @@ matter crossed and becomes colour when light is found, for all wavelengths at on
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from tsdf.compiled import njit
 from tsdf.data.sampler import (
     Tables,
@@ -104,14 +106,19 @@ class CameraArrays(NamedTuple):
     width: int
 
 
+NOBODY = np.zeros(0, np.int64)
+
+
 class Job(NamedTuple):
-    """Samples to take: `spp` of each pixel from `pixel` on, the first of them number `sample`."""
+    """Samples to take: `spp` of each pixel from `pixel` on, the first of them number `sample`. Those of each pixel
+    begin as if they had met `met` single grains, by pixel, none where it is empty."""
 
     camera: CameraArrays
     pixel: int
     spp: int
     sample: int
     seed: int
+    met: np.ndarray = NOBODY
 
 
 @njit(forceinline=True, **KERNEL)
@@ -885,5 +892,7 @@ def spawn(batch, live, job, first, count):
         w.weight, w.luck, w.pdf, w.free, w.skip = 1.0, 0.0, -1.0, -1.0, 0.0
         w.key, w.events, w.sample, w.ray, w.medium, w.mode = key + GOLDEN, 0, local, NONE, UNKNOWN, FLY
         w.tries, w.shadow, w.single = 0, 0, 0
+        if job.met.shape[0] > 0:
+            w.single = job.met[pixel]
         for k in range(batch.amounts.shape[1]):
             batch.amounts[live + i, k] = 0.0

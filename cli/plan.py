@@ -1,0 +1,77 @@
+"""``tsdf-plan``: which level a scene needs, and what each would cost and get wrong."""
+
+import json
+from pathlib import Path
+
+import click
+
+from tsdf.cli.common import (
+    Tool,
+    check_numbers,
+    check_output,
+    plain,
+    say,
+    seed_option,
+    threads_option,
+    working,
+    write_text,
+)
+
+
+@click.command("tsdf-plan", cls=Tool)
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option(
+    "--target", type=float, default=0.02, show_default=True, metavar="E",
+    help="Error of the picture over its mean: bias, missing texture and noise of pixels together.",
+)  # fmt: skip
+@click.option(
+    "--seconds", type=float, metavar="S",
+    help="Time for the picture: what meets the target within it, else what has the least error after it.",
+)  # fmt: skip
+@seed_option("the scene's")
+@click.option("--width", type=int, metavar="PIXELS", help="Width of the picture; its shape is kept.")
+@click.option("--json", "as_json", is_flag=True, help="Print the predictions as JSON.")
+@click.option("--out", type=click.Path(path_type=Path), help="Write the predictions to this file, .json.")
+@threads_option
+@click.option("--quiet", is_flag=True, help="No progress bar; with --out nothing else either.")
+def main(
+    scene: Path, target: float, seconds: float | None, seed: int | None, width: int | None, as_json: bool,
+    out: Path | None, threads: int | None, quiet: bool,
+) -> None:  # fmt: skip
+    """Predict for SCENE, a TOML file, what each level costs and gets wrong, and say which to take.
+
+    It renders a few pixels at each level that may do, for 5 seconds in all, or a tenth of --seconds if that is more;
+    packings, records and machine code that are made for the first time come on top. tsdf-render without a level does
+    the same and renders what is chosen.
+    """
+    from tsdf.errors import UsageError
+    from tsdf.plan.planner import checked_target
+
+    check_numbers(seed, width=width, threads=threads)
+    checked_target(target, "--target")
+    if seconds is not None and not 0.0 < seconds < float("inf"):
+        raise UsageError(f"--seconds is a finite number above 0, not {seconds:g}")
+    if out is not None and out.suffix.lower() != ".json":
+        raise UsageError(f"--out {plain(out)}: is to end in .json")
+
+    from tsdf.plan import planner, report
+    from tsdf.scene.scene import load, resized
+    from tsdf.scene.specs import files_of
+
+    read = resized(load(scene), width)
+    if out is not None:
+        check_output(out, scene, *files_of(read))
+    with working(quiet) as work:
+        plan = planner.plan(read, target, seconds, None, seed, threads, work.progress)
+    text = json.dumps(report.facts(plan), indent=1)
+    if out is not None:
+        write_text(out, text + "\n")
+    if as_json:
+        say(text)
+    elif not (quiet and out is not None):
+        for line in (*plan.why, *(f"table: {need}" for need in plan.needs), "", *report.table(plan)):
+            say(plain(line))
+    if not quiet:
+        for note in plan.notes:
+            click.echo(f"note: {plain(note)}", err=True)
+        click.echo(f"planned in {plan.spent:.1f} s", err=True)

@@ -1,0 +1,177 @@
+"""Plans as a whole, with short pilots: what they must not say, what they refuse, and how they reach pictures."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tsdf
+from tsdf.errors import UsageError
+from tsdf.picture import render, world
+from tsdf.plan import planner, report, shot
+from tsdf.plan.beliefs import CERTAIN, Belief
+from tsdf.plan.pilot import Pilot
+from tsdf.plan.planner import plan
+from tsdf.plan.prediction import Plan, Prediction
+from tsdf.reference_data.make_checks import CHECKS
+from tsdf.scene.scene import (
+    Box,
+    Camera,
+    ConstantLight,
+    GrainSpec,
+    MediumSpec,
+    Rectangle,
+    Render,
+    Scene,
+    SunLight,
+    SurfaceSpec,
+)
+from tsdf.study.candidates import Candidate
+
+LIGHTS = (ConstantLight((0.3, 0.3, 0.3)), SunLight((0.6, 0.0, 0.8), (2.0, 2.0, 2.0), 60.0))
+FEW = 300  # spheres in a tile
+
+
+@pytest.fixture(scope="module")
+def ball() -> tsdf.Table:
+    return tsdf.build("sphere", 1.33, tsdf.Effort(cells=256, joint=32, memory=32))
+
+
+@pytest.fixture(autouse=True)
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plans in a second or so."""
+    monkeypatch.setattr(planner, "SECONDS", 1.5)
+    monkeypatch.setattr(planner, "LEAST_PILOTS", 1.0)
+
+
+def pile(ball: tsdf.Table, distance: float, fraction: float = 0.6, level: str = "auto") -> Scene:
+    """A flat pile of spheres, its camera so far away."""
+    camera = Camera((0.0, -0.8 * distance, 0.6 * distance), (0.0, 0.0, 0.0), 24, 18, fov_deg=30.0)
+    medium = MediumSpec(Box((-12.0, -12.0, -10.0), (12.0, 12.0, 0.0)), fraction, 1.0, (GrainSpec(ball),),
+                        packing_spheres=FEW)  # fmt: skip
+    return Scene(camera, LIGHTS, (medium,), render=Render(level), name="pile")
+
+
+def of(made: Plan, level: str, k: int = 0) -> Prediction:
+    return next(p for p in made.predictions if p.candidate == Candidate(level, k))
+
+
+@pytest.fixture(scope="module")
+def far(ball: tsdf.Table) -> Plan:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(planner, "SECONDS", 3.0)
+        return plan(pile(ball, 160.0), 0.05, threads=2)
+
+
+def test_a_dense_slab_seen_from_afar(far: Plan) -> None:
+    """Spheres packed at 0.6 are too bright at teleport, and a plan knows; not so at teleport-memory. Explicit is right
+    by definition. What is taken meets the target, and there are three lines that say so."""
+    assert of(far, "explicit").floor == CERTAIN and of(far, "explicit").piloted
+    assert of(far, "teleport").bias > 2.0 * of(far, "teleport").bias_error > 0.0
+    assert of(far, "teleport").floor.value > of(far, "teleport-memory").floor.value
+    assert far.chosen.floor.high < far.target and len(far.why) == 3
+    assert far.chosen.seconds(far.target) <= of(far, "explicit").seconds(far.target)
+    assert str(far.chosen.candidate) in far.why[0] and "R" in far.why[1] and far.why[2].startswith("runner-up")
+    assert far.spent < 6.0 and not far.fewer_far
+    told = report.facts(far)
+    assert told["chosen"]["level"] == far.chosen.candidate.level and len(told["candidates"]) == len(far.predictions)
+    assert all(len(line) < 300 and "\n" not in line for line in (*far.why, *far.notes, *far.needs))
+
+
+def test_close_grains_are_met_one_by_one(ball: tsdf.Table) -> None:
+    """Where a pixel covers a fifth of a grain no chain alone will do: explicit grains come first, or there are no
+    others."""
+    made = plan(pile(ball, 9.0), 0.05, threads=2)
+    one = made.chosen.candidate
+    assert one.explicit_grains > 0 or one.level in ("explicit", "teleport-packed")
+    assert of(made, "teleport-memory").floor.value > 0.05
+    assert of(made, "teleport-memory", 16).floor.value < 0.5 * of(made, "teleport-memory").floor.value
+
+
+def test_what_is_measured_wins(ball: tsdf.Table) -> None:
+    """The truth itself, taken for another level, is found without error; a level with light of its own is found out."""
+    scene = pile(ball, 160.0)
+    made = world.build(scene, "volume")
+    one, same = Pilot(made, 1, 2, 64), Pilot(made, 1, 2, 64)
+    bright = Pilot(world.build(replace(scene, lights=(ConstantLight((1.0, 1.0, 1.0)),)), "volume"), 1, 2, 64)
+    for pilot in (one, same, bright):
+        pilot.run(0.3)
+    apart = same.apart(one)
+    assert abs(apart.bias) < 5.0 * apart.bias_error + 1e-3 and abs(apart.square) < 5.0 * apart.square_error + 1e-6
+    apart = bright.apart(one)
+    assert apart.square > 5.0 * apart.square_error
+    seen, picture = one.seen, render.render(made, spp=256, seed=2, threads=2)
+    spp_error = math.sqrt(seen.variance / 256)
+    assert picture.relative_error == pytest.approx(spp_error, rel=0.25)
+    assert picture.rgb.mean() == pytest.approx(seen.mean, rel=0.1)
+
+
+def test_other_wishes_other_choices(far: Plan, ball: tsdf.Table) -> None:
+    """What is found is sorted by time to the target; a level of too much bias is never sure to meet it; with a time
+    that is too short the least error is taken."""
+    times = [p.safe_seconds(far.target) for p in far.predictions[1:]]
+    assert times == sorted(times)
+    biased = replace(of(far, "teleport"), floor=Belief(0.2, 0.01))
+    assert math.isinf(biased.seconds(0.05)) and biased.error(1e9) == pytest.approx(0.2)
+    p = of(far, "explicit")
+    assert p.noise(4.0) == pytest.approx(0.5 * p.noise(1.0)) and p.error(p.seconds(0.03)) == pytest.approx(0.03)
+    hurried = plan(pile(ball, 160.0), 0.002, seconds=0.5, threads=2)
+    assert "least" in hurried.why[0]
+    errors = [math.hypot(p.floor.high, p.noise(0.5 / 1.0)) for p in hurried.predictions]
+    assert errors[0] <= 1.3 * min(errors)
+
+
+def test_only_the_camera_matters_to_scenes_without_grains() -> None:
+    floor = SurfaceSpec(Rectangle((0.0, 0.0, 0.0), (9.0, 0.0, 0.0), (0.0, 9.0, 0.0)), (0.5, 0.5, 0.5))
+    scene = Scene(Camera((0.0, -9.0, 9.0), (0.0, 0.0, 0.0), 8, 6), LIGHTS, (), (floor,))
+    made = plan(scene, 0.05, threads=1)
+    assert made.chosen.floor == CERTAIN and "no grains" in made.why[1]
+
+
+def test_tables_without_records(tmp_path: Path) -> None:
+    """Levels that need them are left out, not fatal; what makes them is said."""
+    table = tsdf.read(CHECKS / "cube.tsdf.exr")
+    assert not table.memory
+    made = plan(pile(table, 160.0), 0.1, threads=2)
+    assert not any(p.candidate.level in ("teleport-memory", "teleport-packed") for p in made.predictions)
+    scene = pile(table, 160.0)
+    tsdf.write(table, tmp_path / "cube.exr")
+    named = replace(scene.media[0], grains=(GrainSpec(tmp_path / "cube.exr"),))
+    (need,) = plan(replace(scene, media=(named,)), 0.1, threads=2).needs
+    assert "no records by entry" in need and "--memory 64" in need
+
+
+@pytest.mark.parametrize("target", [0.0, -0.1, 1.0, math.nan, math.inf])
+def test_bad_targets(ball: tsdf.Table, target: float) -> None:
+    with pytest.raises(UsageError, match="target is an error of pixels") as refused:
+        plan(pile(ball, 160.0), target)
+    assert "\n" not in str(refused.value)
+
+
+def test_auto_in_python(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scene that names no level is planned, one that does is not; a stop that is given is obeyed; what is chosen is
+    rendered to the last bit as if it had been named."""
+    scene = pile(ball, 160.0)
+    choice = shot.chosen(scene, spp=3, threads=2)
+    assert choice.plan is not None and (choice.spp, choice.target_error) == (3, None)
+    found = choice.scene.render
+    monkeypatch.setattr(shot, "plan", lambda *_: choice.plan)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("warnings.warn", lambda *_, **__: None)
+        one = tsdf.render(scene, spp=3, threads=1)
+        named = replace(scene, render=replace(found))
+        other = tsdf.render(named, spp=3, threads=2)
+    np.testing.assert_array_equal(one.rgb, other.rgb)
+    monkeypatch.setattr(shot, "plan", lambda *_: pytest.fail("a plan is made"))
+    assert shot.chosen(scene, "volume").spp == shot.SPP
+    assert shot.chosen(replace(scene, render=Render("volume", 5)), target_error=0.1)[1:4] == (None, None, 0.1)
+
+
+def test_without_a_stop_it_is_done_at_the_target(far: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Noise is what the target leaves beside bias and texture."""
+    monkeypatch.setattr(shot, "plan", lambda *_: far)
+    choice = shot.chosen(far.scene)
+    assert (choice.spp, choice.seconds) == (None, None) and choice.target_error is not None
+    assert math.hypot(choice.target_error, far.chosen.floor.value) == pytest.approx(far.target)

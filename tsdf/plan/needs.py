@@ -1,0 +1,65 @@
+"""Needs: what tables lack for a picture, and the commands that make it."""
+
+import shlex
+from collections.abc import Sequence
+
+from tsdf.data.table import Table
+from tsdf.scene.levels import LEVELS
+
+ENOUGH = 0.25  # of the error that is asked for that a table may be off by
+
+
+def of_tables(tables: Sequence[tuple[str, Table]], target: float, level: str, packed: bool) -> list[str]:
+    """Return what tables need for a picture of an error, one line each.
+
+    Parameters
+    ----------
+    tables : sequence of (str, Table)
+        By the names of their files.
+    target : float
+        Error of the picture [1].
+    level : str
+        That is taken.
+    packed : bool
+        Whether grains can be packed at random and traced.
+    """
+    lines = []
+    for name, table in dict(tables).items():
+        made = table.header["provenance"]["command"]
+        wants: dict[str, str] = {}
+        reasons = []
+        if not table.memory:
+            reasons.append("has no records by entry, which teleport-memory and teleport-packed draw from")
+            wants["--memory"] = "64"
+        if level == "teleport" and not table.joint:
+            loss = table.header["factorisation_error"]["total_variation"]
+            reasons.append(f"has no joint records, and offsets drawn apart are {loss:.0%} off")
+            wants["--joint"] = "32"
+        if LEVELS[level].traits != LEVELS["explicit"].traits:  # which asks no table
+            off = table.header["standard_errors"]["mean_cosine"] / max(1.0 - table.mean_cosine(), 1e-6)
+            paths = table.header["provenance"].get("paths")
+            if off > ENOUGH * target and paths:
+                reasons.append(f"knows 1 - g to {off:.1%} only")
+                wants["--paths"] = f"{min(paths * (off / (ENOUGH * target)) ** 2, 1e10):.1g}"
+            width = table.header["table_error"]["cell_width"]
+            if width > target:
+                reasons.append(f"has cells of theta so wide that they are {width:.1%} off")
+                wants["--cells"] = str(2 * (len(table.header["columns"]["edges"]) - 3))
+        if reasons:
+            lines.append(f"{name} {' and '.join(reasons)}: {_command(made, name, wants)}")
+    return lines
+
+
+def _command(made: str, name: str, wants: dict[str, str]) -> str:
+    """Return the command that made a table, with other options, or what they are where it is not known."""
+    words = shlex.split(made) if made.startswith("tsdf-build ") else []
+    if not words:
+        return "build it by tsdf-build with " + " ".join(f"{option} {value}" for option, value in wants.items())
+    for option, value in wants.items():
+        if option in words:
+            words[words.index(option) + 1] = value
+        else:
+            words += [option, value]
+    if "--out" not in words:
+        words += ["--out", name]
+    return shlex.join(words)

@@ -1,0 +1,112 @@
+"""Predictions of candidates, and the plan that takes one of them."""
+
+import math
+from dataclasses import dataclass, replace
+
+from tsdf.plan.beliefs import Belief
+from tsdf.scene.scene import Scene
+from tsdf.study.candidates import Candidate, taken
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What is predicted of a candidate; errors over the mean of the picture [1].
+
+    Attributes
+    ----------
+    candidate : Candidate
+    bias, bias_error : float
+    texture, texture_error : float
+    floor : Belief
+        Root of bias squared and texture squared: the error that time does not bring down.
+    variance : float
+        Of one sample of a pixel, over the mean of the picture squared [1].
+    turn : float
+        Time on the clock of a sample of each pixel [s].
+    piloted : bool
+        Whether it was rendered, or follows from others that were.
+    known : bool
+        Whether the atlas covers the scene, or a pilot tells.
+    """
+
+    candidate: Candidate
+    bias: float
+    bias_error: float
+    texture: float
+    texture_error: float
+    floor: Belief
+    variance: float
+    turn: float
+    piloted: bool
+    known: bool
+
+    def noise(self, seconds: float) -> float:
+        """Return the standard error of pixels after so long [s]."""
+        return math.sqrt(self.variance * self.turn / seconds)
+
+    def error(self, seconds: float) -> float:
+        """Return the whole error after so long [s]."""
+        return math.hypot(self.floor.value, self.noise(seconds))
+
+    def seconds(self, target: float, floor: float | None = None) -> float:
+        """Return the time to an error [s], infinite where it is out of reach; `floor` instead of what is believed."""
+        left = target**2 - (self.floor.value if floor is None else floor) ** 2
+        return self.variance * self.turn / left if left > 0.0 else math.inf
+
+    def safe_seconds(self, target: float) -> float:
+        """Return the time to an error [s] if the floor is as high as it may well be."""
+        return self.seconds(target, self.floor.high)
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is to be done, and why.
+
+    Attributes
+    ----------
+    scene : Scene
+        As it was planned for.
+    target : float
+        Error that is asked for [1].
+    seconds : float or None
+        Time that the picture may take [s].
+    predictions : tuple of Prediction
+        The chosen first, then by the time to the target.
+    fewer_far : bool
+        Whether the explicit grains are to be fewer where a pixel covers more.
+    why : tuple of str
+        Three lines.
+    needs : tuple of str
+        What the tables lack, one line each.
+    notes : tuple of str
+        What the planner does not know.
+    spent : float
+        Time that planning took, after packings, records and kernels were made [s].
+    threads : int
+    """
+
+    scene: Scene
+    target: float
+    seconds: float | None
+    predictions: tuple[Prediction, ...]
+    fewer_far: bool
+    why: tuple[str, ...]
+    needs: tuple[str, ...]
+    notes: tuple[str, ...]
+    spent: float
+    threads: int
+
+    @property
+    def chosen(self) -> Prediction:
+        return self.predictions[0]
+
+    @property
+    def noise(self) -> float:
+        """Standard error of pixels at which the whole error is the target; half of it where that is out of reach."""
+        return math.sqrt(max(self.target**2 - self.chosen.floor.value**2, 0.25 * self.target**2))
+
+    @property
+    def planned(self) -> Scene:
+        """The scene, to be rendered as it is chosen."""
+        scene = taken(self.scene, self.chosen.candidate)
+        return replace(scene, render=replace(scene.render, fewer_far=self.fewer_far))

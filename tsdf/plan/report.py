@@ -1,0 +1,189 @@
+"""Reports: what a plan says of itself, in three lines, as a table and as facts."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from tsdf.plan.prediction import Plan, Prediction
+from tsdf.plan.prior import Body
+
+TARGETS = np.geomspace(0.002, 0.5, 120)  # [1] that are tried for what would change a plan's mind
+
+
+def why(plan: Plan, bodies: Sequence[Body], footprint: float, coverage: float, reference: str) -> tuple[str, ...]:
+    """Return three lines: what is taken and what it does, why, and what would change that."""
+    return (_first(plan), _reason(plan, bodies, footprint, coverage, reference), _other(plan))
+
+
+def short(prediction: Prediction) -> str:
+    """Return a candidate and its parts in one phrase."""
+    p = prediction
+    if not p.floor.high:
+        return f"{p.candidate} has neither bias nor missing texture"
+    return (
+        f"{p.candidate} has a bias of {percent(p.bias)} ± {percent(p.bias_error)} and misses texture of "
+        f"{percent(p.texture)} ± {percent(p.texture_error)}"
+    )
+
+
+def percent(value: float) -> str:
+    """Return a share in per cent with two digits."""
+    return f"{100.0 * value:.2g} %" if abs(value) < 0.995 else f"{100.0 * value:.0f} %"
+
+
+def span(seconds: float) -> str:
+    """Return a time as one reads it."""
+    if math.isinf(seconds):
+        return "no time"
+    if seconds < 100.0:
+        return f"{seconds:.2g} s"
+    for unit, size in (("min", 60.0), ("h", 3600.0)):
+        if seconds < 100.0 * size:
+            return f"{seconds / size:.2g} {unit}"
+    return f"{seconds / 86400.0:.3g} days"
+
+
+def _first(plan: Plan) -> str:
+    p = plan.chosen
+    far = ", fewer where a pixel covers more" if plan.fewer_far else ""
+    takes = p.seconds(plan.target)
+    if plan.seconds is not None and not takes <= plan.seconds:
+        after = f"an error of {percent(p.error(plan.seconds))} after {span(plan.seconds)}"
+        met = f"none is sure to meet {percent(plan.target)} in that time, and this one has least"
+    elif math.isinf(takes):
+        after, met = f"an error of {percent(p.floor.value)} at best", f"none is sure to meet {percent(plan.target)}"
+    else:
+        after = f"an error of {percent(plan.target)} after about {span(takes)}"
+        met = f"noise {percent(math.sqrt(max(plan.target**2 - p.floor.value**2, 0.0)))}"
+    return f"take {p.candidate}{far}: {after} ({met})"
+
+
+def _reason(plan: Plan, bodies: Sequence[Body], footprint: float, coverage: float, reference: str) -> str:
+    chosen = plan.chosen
+    if not bodies:
+        return "because there are no grains in the scene, and all levels are the same"
+    body = max(bodies, key=lambda one: one.thickness)
+    seen = f"a pixel covers {footprint:.2g} R" if math.isfinite(footprint) else "no grains are seen"
+    deep = body.thickness / body.transport
+    where = f"{seen}, f = {body.packing_fraction:g}, {body.thickness:.2g} R or {deep:.2g} l* thick"
+    turn = chosen.variance * chosen.turn
+    worse = [p for p in plan.predictions[1:] if p.variance * p.turn < turn and p.floor.high > 0.0]
+    nearest = min(worse, key=lambda p: p.floor.value, default=None)
+    than = f"; {short(nearest)}, and would take less" if nearest is not None else "; nothing takes less"
+    return f"because {where}; {short(chosen)}{than}"
+
+
+def _other(plan: Plan) -> str:
+    if len(plan.predictions) < 2:
+        return "no other candidate is possible"
+    second, chosen = plan.predictions[1], plan.chosen
+    takes = second.safe_seconds(plan.target)
+    runner = f"runner-up: {second.candidate}, {span(takes)}" if math.isfinite(takes) else (
+        f"runner-up: {second.candidate}, error {percent(second.floor.value)} at best"
+    )  # fmt: skip
+    flips = {}
+    for target in TARGETS:
+        best = min(plan.predictions, key=lambda p: p.safe_seconds(float(target)))
+        if math.isfinite(best.safe_seconds(float(target))):
+            flips[float(target)] = best
+    lower = [t for t, p in flips.items() if t < plan.target and p is not chosen]
+    upper = [t for t, p in flips.items() if t > plan.target and p is not chosen]
+    changes = []
+    if lower:
+        changes.append(f"a target below {percent(max(lower))} ({flips[max(lower)].candidate})")
+    if upper:
+        changes.append(f"one above {percent(min(upper))} ({flips[min(upper)].candidate})")
+    return (
+        f"{runner}; {' or '.join(changes)} would change this"
+        if changes
+        else f"{runner}; no other target would change this"
+    )
+
+
+def table(plan: Plan) -> list[str]:
+    """Return a table of all candidates as lines of text."""
+    after = plan.seconds
+    head = ["candidate", "bias %", "texture %", "error at best %", f"time to {percent(plan.target)}"]
+    head += [f"error after {span(after)}"] if after is not None else []
+    rows = [[*head, "by"]]
+    for p in plan.predictions:
+        row = [
+            str(p.candidate),
+            f"{100 * p.bias:+.2f} ± {100 * p.bias_error:.2f}",
+            f"{100 * p.texture:.2f} ± {100 * p.texture_error:.2f}",
+            f"{100 * p.floor.value:.2f} ± {100 * p.floor.error:.2f}",
+            span(p.seconds(plan.target)) if math.isfinite(p.seconds(plan.target)) else "never",
+        ]
+        row += [percent(p.error(after))] if after is not None else []
+        rows.append([*row, "pilot" if p.piloted else "others"])
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def facts(plan: Plan) -> dict[str, Any]:
+    """Return a plan as JSON takes it; what is infinite is null."""
+
+    def number(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    return {
+        "scene": plan.scene.name,
+        "target": plan.target,
+        "seconds": plan.seconds,
+        "threads": plan.threads,
+        "chosen": chosen_facts(plan),
+        "why": list(plan.why),
+        "needs": list(plan.needs),
+        "notes": list(plan.notes),
+        "planning_seconds": round(plan.spent, 2),
+        "candidates": [
+            {
+                "level": p.candidate.level,
+                "explicit_grains": p.candidate.explicit_grains,
+                "leap": p.candidate.leap,
+                "bias": p.bias,
+                "bias_error": p.bias_error,
+                "texture": p.texture,
+                "texture_error": p.texture_error,
+                "floor": p.floor.value,
+                "floor_error": p.floor.error,
+                "variance_of_a_sample": p.variance,
+                "seconds_per_sample_of_all_pixels": number(p.turn),
+                "noise": number(p.noise(plan.seconds)) if plan.seconds is not None else None,
+                "error": number(p.error(plan.seconds)) if plan.seconds is not None else None,
+                "seconds_to_target": number(p.seconds(plan.target)),
+                "piloted": p.piloted,
+                "known": p.known,
+            }
+            for p in plan.predictions
+        ],
+    }
+
+
+def chosen_facts(plan: Plan) -> dict[str, Any]:
+    """Return what is taken, as JSON takes it."""
+    one = plan.chosen.candidate
+    return {
+        "level": one.level,
+        "explicit_grains": one.explicit_grains,
+        "fewer_far": plan.fewer_far,
+        "target": plan.target,
+        "noise": plan.noise,
+    }
+
+
+def options(plan: Plan) -> str:
+    """Return the options of ``tsdf-render`` that fix what is chosen."""
+    one = plan.chosen.candidate
+    words = f"--level {one.level}"
+    if one.explicit_grains:
+        words += f" --explicit-grains {one.explicit_grains}" + "-0" * plan.fewer_far
+    return words
+
+
+def notes(plan: Plan) -> tuple[str, ...]:
+    """Return what ``tsdf-render`` says of a plan: what it takes and how that is fixed, why, what it does not know."""
+    fixed = f"level auto: {plan.why[0]}; {options(plan)} fixes it"
+    return fixed, *plan.why[1:2], *plan.notes, *plan.needs
