@@ -84,7 +84,12 @@ CONCAVE = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", list(exemplars.EXEMPLARS))
+FINE = ("snow", "sand", "fresh", "faceted", "rounded")  # of 10,000 facets and more
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in FINE else name for name in exemplars.EXEMPLARS]
+)
 def test_exemplars_are_clean(name):
     """Every exemplar passes without a note, is normalised, and comes out the same twice."""
     grain, again = load_grain(name), load_grain(name)
