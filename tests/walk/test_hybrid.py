@@ -88,7 +88,7 @@ def heap(tmp_path_factory: pytest.TempPathFactory, ball: Table, cube: Table) -> 
 def asking(scene: Scene, singles: int, inside: str = "grains", lights: tuple = ()) -> Scene:
     """Return a scene that asks for so many explicit grains, with another convention or other lights."""
     media = tuple(replace(medium, inside=inside) for medium in scene.media)
-    return replace(scene, media=media, render=Render(explicit_grains=singles), lights=lights or scene.lights)
+    return replace(scene, media=media, render=Render(spp=64, explicit_grains=singles), lights=lights or scene.lights)
 
 
 def picture(scene: Scene, level: str, spp: int = 16, threads: int = 2, seed: int = 0) -> Picture:

@@ -235,7 +235,7 @@ class Setting:
         def make() -> Table:
             from tsdf.make.scatterometer import Build
 
-            grain = tsdf.load_grain(name, **parameters)
+            grain = tsdf.load_grain(name, repair=False, **parameters)
             built = Build.start(grain, tsdf.Optics(eta), tsdf.Effort(paths, cells=128, joint=16, memory=64))
             built.run(grain, self.threads or 2)
             return built.table()
