@@ -687,6 +687,7 @@ def test_wall_too_thin():
     refused("thinner than", mesh()[0] * [1, 1, 1e-6], mesh()[1])
 
 
+@pytest.mark.slow
 def test_crossing_check_is_fast_and_quiet():
     """Clean grains with sharp edges, necks and cavities: no ray is called a crossing, few are flukes."""
     ball = mesh("icosphere", subdivisions=3)
