@@ -2,8 +2,8 @@
 
 Cubes of absorbing grains in white light are measured as `tsdf-frontier` does, and so are Mitsuba's pictures of them,
 against the same truth: error against processor time of all threads. Each peer's picture is the mean of sixteen, whose
-spread is its noise. Writes DIR/peers.md and peers.png: each point of a peer beside the least error of our candidates
-after the same time.
+spread is its noise. Roulette is off in ``volpath``, which changes little here.
+Writes DIR/peers.md and peers.png: each point of a peer beside the least error of our candidates after the same time.
 
     python benchmarks/bench_peers.py --out bench
 """
@@ -88,7 +88,7 @@ def theirs(peer: str, name: str, fraction: float, half: float, absorption: float
     table = tsdf_format.read(library.FOLDER / f"{name}{library.SUFFIX}")
     grains = {"packing_fraction": fraction, "grain_radius": 1.0, "absorption": absorption}
     interior = loader.medium(table, **grains) if peer == "volpath" else loader.granular(table, **grains)
-    integrator = {"type": "tpt"} if peer == "tpt" else {"type": "volpath", "max_depth": -1}
+    integrator = {"type": "tpt"} if peer == "tpt" else {"type": "volpath", "max_depth": -1, "rr_depth": 1_000_000}
     look = mi.ScalarTransform4f().look_at([0.5 * half, -5.0 * half, 1.2 * half], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     cube = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(half), "bsdf": {"type": "null"}}
@@ -107,7 +107,7 @@ def measure(case: tuple[str, float, float, float], seconds: float, runs: int) ->
     """Return our frontier and the peers' numbers."""
     scene, notes = ours(*case), list[str]()
     truth = frontier._truth(scene, notes)
-    ways = frontier._possible(scene, candidates(grains=(0, 3)), truth, notes, lambda share, word: None)
+    ways = frontier._possible(scene, candidates(grains=(0, 3)), truth, notes, lambda *_: None, threading.Event())
     peers = []
     for name, level in PEERS.items():
         peer = Peer(Candidate(level), build(taken(scene, Candidate(level)), level), 0)

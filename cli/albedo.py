@@ -8,7 +8,7 @@ import click
 from click.core import ParameterSource
 
 from tsdf.cli import spectral
-from tsdf.cli.common import Tool, check_numbers, named_levels, plain, whole_number, working
+from tsdf.cli.common import Tool, check_numbers, named_levels, plain, seed_option, whole_number, working
 from tsdf.errors import UsageError
 
 COMMANDLINE = ParameterSource.COMMANDLINE
@@ -41,7 +41,7 @@ COMMANDLINE = ParameterSource.COMMANDLINE
 @click.option(
     "--mesh", type=click.Path(path_type=Path), metavar="FILE", help="Of tables' grain, for --level explicit."
 )  # fmt: skip
-@click.option("--seed", callback=whole_number, default="0", show_default=True, metavar="N", help="Of random numbers.")
+@seed_option("0")
 def main(  # noqa: PLR0913 - an argument for each option
     grains: tuple[str, ...], as_json: bool, csv_file: Path | None, plot: Path | None, quiet: bool, level: str,
     packing: float, density: float | None, thickness: float | None, angle: float | None, diffuse: bool, ground: float,

@@ -110,7 +110,7 @@ def _lines(table: "PackingTable", name: str = "") -> Iterator[str]:
     yield f"  {'pixels_sha256':<16}{table.header['pixels_sha256']}"
     yield (
         "fraction  <gap^2> / 2 lambda_b^2  <b_o b_i cos psi>     corr(b_o^2, b_i^2)    "
-        "displacement per event [R^2], that of the table"
+        "displacement per event of spheres, eta 1.31 [R^2], the table's"
     )
     for entry in table.header["fractions"]:
         s, e = entry["statistics"], entry["standard_errors"]

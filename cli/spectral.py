@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from tsdf.cli.common import check_output, plain, say, setting, whole_number
+from tsdf.cli.common import check_output, plain, say, setting, threads_option, whole_number
 from tsdf.cli.sizes import by_option, measured
 from tsdf.errors import UsageError
 
@@ -46,7 +46,7 @@ def building(command: Command) -> Command:
                          help="A parameter of a built-in grain; tsdf-build --grains lists them."),
             click.option("--table-paths", callback=whole_number, default=f"{TABLE_PATHS:g}", show_default=True,
                          metavar="N", help="Paths of each table that is made of a GRAIN."),
-            click.option("--threads", callback=whole_number, metavar="N", help="[default: all processors]"),
+            threads_option,
         )
     ):  # fmt: skip
         command = add(command)

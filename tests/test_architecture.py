@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,7 @@ DOORS = {
 }
 
 
+@cache
 def imports(path: Path) -> list[tuple[str, bool]]:
     """Return the modules a file imports, in full, and whether at its top level."""
     tree = ast.parse(path.read_text())

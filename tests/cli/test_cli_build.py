@@ -143,6 +143,7 @@ def test_a_quality_says_how_long_first(monkeypatch: pytest.MonkeyPatch) -> None:
     assert note.startswith("--quality draft: about 3.3e+04 paths at 1.0e+03 a second, 30 s more, to a factor of two")
 
 
+@pytest.mark.slow
 def test_a_quality_is_a_target_and_records(tmp_path: Path) -> None:
     """Records may be said otherwise; what else says how much to trace contradicts it, in one line."""
     for words, joint, memory in (((), 8, 32), (("--joint", "4", "--memory", "0"), 4, 0)):
@@ -364,6 +365,7 @@ def test_more_parts_than_chunks(tmp_path: Path) -> None:
     assert (tmp_path / "m.exr").read_bytes() == (tmp_path / "w.exr").read_bytes()
 
 
+@pytest.mark.slow
 def test_refused_builds_leave_nothing_in_the_way(tmp_path: Path) -> None:
     out = tmp_path / "x.exr"
     result = run("icosphere", "--eta", "1.5", "--paths", "20000", "--max-bounces", "2", "--quiet", "--out", out)

@@ -42,6 +42,7 @@ def facts(path: Path) -> dict:
     return json.loads(image.read_exr(path).attributes["tsdf_render"])
 
 
+@pytest.mark.slow
 def test_an_error_bar_that_cannot_be_trusted(folder: Path) -> None:
     """Beads under a small sun that level explicit cannot aim at: one line, also when quiet, and in the file; the same
     under a bright sky are trusted, and nothing is said."""

@@ -70,6 +70,7 @@ def test_weak_absorption_is_that_of_the_enhancement():
     assert 1.0 - table.single_scattering_albedo(x).value == pytest.approx(b * thin, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_prism_in_others_words(prisms):
     """All directions inside are reached at 1.31, so B is eta^2; at 3 V / S the radius is that of convex bodies."""
     for table in prisms:

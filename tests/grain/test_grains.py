@@ -84,7 +84,12 @@ CONCAVE = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", list(exemplars.EXEMPLARS))
+FINE = ("snow", "sand", "fresh", "faceted", "rounded")  # of 10,000 facets and more
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in FINE else name for name in exemplars.EXEMPLARS]
+)
 def test_exemplars_are_clean(name):
     """Every exemplar passes without a note, is normalised, and comes out the same twice."""
     grain, again = load_grain(name), load_grain(name)
@@ -682,6 +687,7 @@ def test_wall_too_thin():
     refused("thinner than", mesh()[0] * [1, 1, 1e-6], mesh()[1])
 
 
+@pytest.mark.slow
 def test_crossing_check_is_fast_and_quiet():
     """Clean grains with sharp edges, necks and cavities: no ray is called a crossing, few are flukes."""
     ball = mesh("icosphere", subdivisions=3)

@@ -238,3 +238,29 @@ def test_a_mirror_is_valid_and_cannot_be_listed(tmp_path):
     table = build.table()
     assert abs(table.mean_cosine()) < 1e-3
     assert judge(table)[0] == ()
+
+
+@pytest.mark.parametrize("eta", [1.0 + 1e-6, 1.0 - 1e-6, 1.0 + 1e-5])
+def test_a_sphere_that_hardly_deflects_is_sound(eta):
+    """What is deflected by less than 1e-5 rad counts as an atom where paths are traced: nearly all light, or some of
+    it. The same light under an index that would deflect ten times as far is an error, and so are lost moments."""
+    table = traced(eta=eta, memory=8)
+    assert errors(table) == set()
+    header = thawed(table.header)
+    header["optics"]["eta"] = 1.0 + 10.0 * (eta - 1.0)
+    assert "PHYSICS_SPHERE_P_THETA" in errors(Table(header, table.pixels)) or eta == 1.0 + 1e-5
+    header = thawed(table.header)
+    header["statistics"]["legendre_moments"][16] -= 1e-4
+    assert {"PHYSICS_SPHERE_STATISTICS", "STATISTICS_LEGENDRE"} & errors(Table(header, table.pixels))
+
+
+@pytest.mark.slow
+def test_records_need_not_show_what_is_rare():
+    """A share 4e-4 of the light enters a sphere of eta 0.02: no record may be of it. Records that all have moved 0.1 R
+    are an error."""
+    table = exact_sphere(load_grain("sphere"), Optics(0.02), Effort(cells=32, memory=8))
+    assert errors(table) == set()
+    pixels = table.pixels.copy()
+    (block,) = (block for block in table.header["blocks"] if block["name"] == "memory_r")
+    pixels[block["first_row"] : block["first_row"] + block["rows"]] += 0.1
+    assert "STATISTICS_MEMORY" in errors(Table(table.header, pixels))

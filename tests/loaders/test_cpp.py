@@ -266,6 +266,7 @@ def test_events_of_a_traced_table(program: Path) -> None:
         np.testing.assert_allclose(made[:, 10:], out.offset, rtol=0.0, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_an_axis_of_many_cells(program: Path, tmp_path: Path) -> None:
     """More than 256 cells: the guide keeps the upper bits of the cell only, which must not change an event."""
     path = tmp_path / "tall.tsdf.exr"

@@ -370,6 +370,7 @@ def test_each_text_says_level_and_error(cube: Table, target: str) -> None:
     assert f"total variation {fits['two_lobe' if two else 'henyey_greenstein']['total_variation']:.2g}" in text
 
 
+@pytest.mark.slow
 def test_measured_error(cube: Table) -> None:
     """--measure states the difference of level volume-hg to level teleport, from a slab rendered at both."""
     text = written("pbrt", "--measure")

@@ -160,6 +160,7 @@ def test_resuming_gives_the_same_bytes(octahedron: Grain, reference: bytes, tmp_
     assert (tmp_path / "r.tsdf.exr").read_bytes() == reference
 
 
+@pytest.mark.slow
 def test_paths_serve_every_request_they_can_answer(octahedron: Grain, reference: bytes, tmp_path: Path) -> None:
     """Other cells, fewer records, fewer and more paths, a target: the very bytes of a build of its own, where there is
     one; else a message that says what the part file can answer."""
@@ -507,6 +508,7 @@ def test_identity() -> None:
     assert abs(s["mean_z"] - chord) < 4 * e["mean_z"] + 1e-3
 
 
+@pytest.mark.slow
 def test_absorption_of_a_mesh_follows_the_sphere() -> None:
     """A fine icosphere's table, absorbing, is near the exact absorbing sphere: the facets cost a percent."""
     table = built(load_grain("icosphere", subdivisions=4), Optics(1.33), paths=200_000)

@@ -287,6 +287,7 @@ def by_entry(eta: float, columns: int) -> dict[str, np.ndarray]:
     return {name: np.bincount(cell, events.weight * value) / whole for name, value in values.items()}
 
 
+@pytest.mark.slow
 def test_records_by_entry_of_a_sphere() -> None:
     """Means by cell of entry_b2 against the exact sphere: each within 4.5 standard errors of K draws, 264 of them;
     mean square deviation below 1 and four of its errors (K draws from a sorted pool scatter less than unrelated ones).

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import pdist
 
 from tsdf.data.table import Table, thawed
 from tsdf.errors import UsageError
@@ -55,6 +56,16 @@ def test_dimensions_of_solids(name, shape, across, hole):
     vertices = load_grain(name, **shape).vertices
     assert maximum_dimension(vertices) == pytest.approx(across, rel=1e-9)
     assert sieve(vertices) == pytest.approx(hole, rel=1e-6)
+
+
+@pytest.mark.parametrize("squeezed", [1.0, 0.999, 0.99, 0.5])
+def test_the_widest_of_many_vertices(squeezed):
+    """Of 5000 points on a ball, squeezed or not, two outside it: as by all pairs."""
+    rng = np.random.default_rng(4)
+    points = rng.normal(size=(5000, 3))
+    points *= np.array([1.0, 1.0, squeezed]) / np.linalg.norm(points, axis=1, keepdims=True)
+    points[:2] *= 1.0001
+    assert maximum_dimension(points) == pytest.approx(pdist(points).max(), rel=1e-12)
 
 
 def test_a_sieve_does_not_know_how_a_grain_is_turned():

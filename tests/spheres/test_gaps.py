@@ -56,6 +56,7 @@ def forwards(records: Records) -> Records:
 # ------------------------------------------------------------------------------------------ lines
 
 
+@pytest.mark.slow
 def test_mean_gap_is_exact(samples: list[Records]) -> None:
     """4 (1 - f) / (3 f) of any packing, within 4 standard errors; control: f off by a twentieth is found out."""
     gap, error = of_samples(samples, lambda r: r.gap.mean())

@@ -98,6 +98,7 @@ def test_dense_fluid_has_the_contacts_of_the_equilibrium(packings: dict[float, P
     assert abs(value - theory(0.45)) > 4.0 * error
 
 
+@pytest.mark.slow
 def test_thin_fluid_has_room_for_one_more_as_the_equilibrium_has(packings: dict[float, Packing]) -> None:
     """The share of points where a further sphere fits is exp(-mu), mu the excess potential of Carnahan & Starling.
 

@@ -100,6 +100,7 @@ def test_thin_slab_is_single_scattering(table: Table, grain: GrainSpec) -> None:
     assert abs(tilted.reflectance - once) > SIGMAS * tilted.reflectance_error + 2.0 * t * once
 
 
+@pytest.mark.slow
 def test_slabs_are_cut_from_several_heights(grain: GrainSpec) -> None:
     """Cuts are as far apart as a layer and a grain, and within the tile. Another height is another slab of spheres, the
     one a whole tile higher is the same."""
@@ -286,6 +287,7 @@ def test_grains_that_let_no_light_in_have_no_absorbing_slabs() -> None:
     assert any("left out" in note for note in found.notes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("word", "rows"), [("start: packing 1", 0), ("bulk, volume", 0), ("layer of 2 R at 0", 3)])
 def test_interruption_keeps_what_is_done(word: str, rows: int, grain: GrainSpec) -> None:
     """At any step what came before it stays: nothing at the start, the bulk's three levels at the first slab."""
@@ -301,6 +303,7 @@ def test_interruption_keeps_what_is_done(word: str, rows: int, grain: GrainSpec)
     assert len(found.rows) == rows
 
 
+@pytest.mark.slow
 def test_time_is_kept_on_the_clock(grain: GrainSpec, monkeypatch: pytest.MonkeyPatch) -> None:
     """A start of 1000 s (of a clock that leaps whenever a packing is made) costs the measuring nothing, and runs that
     take ten times their share leave less to the next: asked for 60 s, all runs together are given no more."""

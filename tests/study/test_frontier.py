@@ -224,6 +224,20 @@ def test_a_furnace_has_no_error_and_no_noise(ball: Scene, tmp_path: Path) -> Non
     frontier_plots.plot_frontier(made)
 
 
+def test_pictures_that_fill_the_memory_are_refused(ball: Scene) -> None:
+    large = replace(ball, camera=replace(ball.camera, width=2000, height=1500))
+    with pytest.raises(UsageError, match="--width"):
+        frontier.measure(large, [Candidate("volume")], 0.2, 10, threads=1)
+
+
+def test_a_scene_without_grains_is_the_same_at_all_levels(ball: Scene) -> None:
+    """Nothing to pack, no medium to have sides or a rim: the plate alone, without a floor that is seen."""
+    made = frontier.measure(replace(ball, media=()), candidates(("explicit", "volume")), 0.2, 3, threads=1)
+    assert made is not None and set(made.regions) == {"whole", "object"}
+    assert all(chance(row.squares) > 1e-3 for row in made.rows)
+    frontier_plots.plot_frontier(made)
+
+
 @pytest.mark.parametrize(("run", "rows"), [("run 1 of 3", None), ("run 3 of 3", 2), ("never", 3)])
 def test_interruption_keeps_the_runs_that_are_done(ball: Scene, run: str, rows: int | None) -> None:
     """A stop in the first run leaves nothing, one in the third two runs; until then nothing is said to be kept."""

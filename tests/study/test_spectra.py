@@ -33,6 +33,7 @@ def found(ice: Constants, family: Family) -> Spectrum:
     return spectra.spectrum(family, ice, RADIUS)
 
 
+@pytest.mark.slow
 def test_spheres_are_exact_at_every_index(ice: Constants, found: Spectrum) -> None:
     """The exact sphere of each index and absorption, by an integral that knows no table. The lossless g is within the
     stated error; with absorption cells of path length and angle cost 2e-4 more. Held at one index g is not."""

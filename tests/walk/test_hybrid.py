@@ -88,7 +88,7 @@ def heap(tmp_path_factory: pytest.TempPathFactory, ball: Table, cube: Table) -> 
 def asking(scene: Scene, singles: int, inside: str = "grains", lights: tuple = ()) -> Scene:
     """Return a scene that asks for so many explicit grains, with another convention or other lights."""
     media = tuple(replace(medium, inside=inside) for medium in scene.media)
-    return replace(scene, media=media, render=Render(explicit_grains=singles), lights=lights or scene.lights)
+    return replace(scene, media=media, render=Render(spp=64, explicit_grains=singles), lights=lights or scene.lights)
 
 
 def picture(scene: Scene, level: str, spp: int = 16, threads: int = 2, seed: int = 0) -> Picture:
@@ -142,6 +142,7 @@ def test_furnace(heap: Scene, ball: Table, cube: Table, level: str, inside: str)
         assert (made.rgb == 1.0).all() and made.events > 150
 
 
+@pytest.mark.slow
 def test_deep_below_the_first_grains_the_chain_leaps(ball: Table, sky: Path) -> None:
     """What a slab of seven transport mean free paths sends back of a sky, with three explicit grains, is with leaps
     what it is without, within 4 standard errors of half a per cent. The control has its balls about where light is
@@ -264,6 +265,7 @@ def layer(level: str, singles: int, table: Table, sky: Path, spp: int = 60_000, 
     return render.measure(made, world.beam(made, (0.0, 0.0, 50.0), DOWN, 300.0), spp=spp, seed=singles, threads=2)
 
 
+@pytest.mark.slow
 def test_reflectance_of_a_layer(ball: Table, sky: Path) -> None:
     """teleport-memory after any number of grains is as bright as the explicit level; teleport is not before there
     are many, and comes nearer with each."""

@@ -100,6 +100,7 @@ def test_slabs_send_the_same_light_back(level: str, ball: Table) -> None:
     assert np.abs(deviation(light(leapt, 60_000, 1), truth)).max() > 8.0
 
 
+@pytest.mark.slow
 def test_mixtures_and_grains_that_are_missed(ball: Table, cube: Table) -> None:
     """The same for two kinds of grains of different absorption, of which one is missed by a third of the spheres."""
     for level in ("teleport-memory", "teleport-joint"):
@@ -175,6 +176,7 @@ def test_the_smaller_a_sun_the_deeper_leaps_stay(ball: Table) -> None:
     assert made.leaps.size[0, 1] == pytest.approx(10.75 * made.media.free[0], rel=1e-2)
 
 
+@pytest.mark.slow
 def test_meshes_and_what_is_buried(ball: Table, tmp_path: Path) -> None:
     """A mesh of a ball with a dark ball buried in it: what comes out with leaps is what comes out without. The control
     takes leaps through the dark ball, for what they look at does not see it."""
@@ -202,6 +204,7 @@ def test_meshes_and_what_is_buried(ball: Table, tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------ records
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["teleport-memory", "teleport-joint", "teleport"])
 def test_the_mean_square_step_is_that_of_diffusion(level: str, ball: Table, cube: Table) -> None:
     """What sums over the records say a martingale's step is, light does in an endless medium: within 4 standard errors
@@ -221,6 +224,7 @@ def known(level: str, table: Table, fraction: float) -> passage.Passage:
     return passage.made(Chain(made.media, made.tables, made.memory), 0, float(made.media.free[0]), 1.0, 2)
 
 
+@pytest.mark.slow
 def test_records_are_kept_and_made_again_when_the_table_changes(
     ball: Table, cube: Table, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -162,6 +162,7 @@ def test_slabs_of_packed_spheres(
     assert fraction < 0.5 or found.rgb[0] - own.rgb[0] > 0.008
 
 
+@pytest.mark.slow
 def test_packings_agree(ball: Table, sky: Path) -> None:
     """Tiles of 2000 and of 500 spheres say the same; another thickness is seen."""
     a, b = (
@@ -248,6 +249,7 @@ def test_energy_absorbed_at_an_event(ball: Table, sky: Path) -> None:
         assert abs(lost - (1.0 - ball.albedo(0.4))) > SIGMAS * found.error[2] / found.events
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["teleport", "volume", "explicit"])
 def test_channels_are_renders_of_their_own(ball: Table, level: str) -> None:
     """Absorption [r, g, b] is what three grey scenes give. The free path of `volume` depends on the mean absorption,

@@ -203,6 +203,7 @@ def test_furnace_at_any_packing(fraction, level, ball):
     assert (take(scene, level, 2).rgb == 1.0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [x for x in LEVELS if not LEVELS[x].traits.packed])
 def test_furnace_of_optical_thickness_1000(level, ball):
     """In a slab of optical thickness 1000 and more, seen from its middle and from outside, no path is given up."""

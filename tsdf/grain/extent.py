@@ -15,24 +15,39 @@ Floats = NDArray[np.float64]
 DIRECTIONS, TURNS = 300, 24  # from which the search for a sieve starts
 STARTS = 8  # of these, from which it goes on
 TOLERANCE = {"xatol": 1e-7, "fatol": 1e-9}  # where a search ends [rad, R]
-BLOCK = 1024  # vertices whose distances to all are held at once
+MANY, NEAR = 4096, 0.1  # vertices of a body like a ball, and how near [R] they stand to the opposite, if few are asked
+BLOCK = 1024  # its square is how many distances are held at once
 ALIKE = 512  # directions whose extreme vertices stand for all where a search starts
 
 
 def maximum_dimension(vertices: Floats) -> float:
     """Return the greatest distance between two points of a body, given its vertices (n, 3)."""
+    few = _extremes(vertices)
+    least = _widest(few, few)
     reach = np.linalg.norm(vertices, axis=1)
-    points = vertices[reach >= _widest(_extremes(vertices)) - reach.max() * (1.0 + 1e-9)]  # others have no one so far
-    return _widest(points)
+    points = vertices[reach >= least - reach.max() * (1.0 + 1e-9)]  # others have no one so far
+    # |p + q|^2 + |p - q|^2 = 2 |p|^2 + 2 |q|^2: of a body like a ball, who is as far stands near the opposite
+    near = math.sqrt(max(4.0 * reach.max() ** 2 - least**2, 0.0)) + 1e-9 * reach.max()
+    if len(points) <= MANY or near > NEAR * reach.max():
+        return max(least, _widest(points, points))
+    from scipy.spatial import cKDTree
+
+    opposite = cKDTree(-points)
+    for first in range(0, len(points), BLOCK):
+        part = points[first : first + BLOCK]
+        found = opposite.query_ball_point(part, near)
+        one, other = np.repeat(np.arange(len(part)), [len(some) for some in found]), np.concatenate(found).astype(int)
+        least = max(least, float(np.linalg.norm(part[one] - points[other], axis=1).max(initial=0.0)))
+    return least
 
 
-def _widest(points: Floats) -> float:
-    """Return the greatest distance between two of some points."""
-    squares = (points**2).sum(axis=1)
-    most = 0.0
-    for i in range(0, len(points), BLOCK):
-        part = slice(i, i + BLOCK)
-        most = max(most, float((squares[part, None] + squares - 2.0 * points[part] @ points.T).max()))
+def _widest(points: Floats, others: Floats) -> float:
+    """Return the greatest distance between one of some points and one of others."""
+    squares, most = (others**2).sum(axis=1), 0.0
+    rows = max(1, BLOCK**2 // len(others))
+    for i in range(0, len(points), rows):
+        part = points[i : i + rows]
+        most = max(most, float(((part**2).sum(axis=1)[:, None] + squares - 2.0 * part @ others.T).max()))
     return math.sqrt(most)
 
 
@@ -109,9 +124,12 @@ def _rotation(turn: Floats) -> Floats:
 
 def _extremes(points: Floats) -> Floats:
     """Return the points that are farthest in some direction, of many directions."""
-    along = _hemisphere(ALIKE) @ points.T
-    chosen: Floats = points[np.unique([along.argmax(axis=1), along.argmin(axis=1)])]
-    return chosen
+    directions, chosen, step = _hemisphere(ALIKE), [], max(1, BLOCK**2 // len(points))
+    for first in range(0, ALIKE, step):
+        along = directions[first : first + step] @ points.T
+        chosen += [along.argmax(axis=1), along.argmin(axis=1)]
+    found: Floats = points[np.unique(np.concatenate(chosen))]
+    return found
 
 
 def _hemisphere(count: int) -> Floats:

@@ -240,14 +240,17 @@ def judge_memory(gavel: Gavel, t: Subject) -> None:
 
     weight = hit / hit.sum()
     distinct = 1 + (np.diff(memory["entry_b2"], axis=0) != 0.0).sum(axis=0)
-    names = {"cos_theta": "mean_cosine", "r": "mean_r", "z": "mean_z", "l": "mean_path_length"}
-    for name, statistic in names.items():
+    names = {"cos_theta": ("mean_cosine", 2.0), "r": ("mean_r", 2.0), "z": ("mean_z", 3.0)}  # and how far they reach
+    names["l"] = "mean_path_length", 2.0
+    for name, (statistic, reach) in names.items():
         values = memory[name].astype(np.float64)
         means = values.mean(axis=0)
         mean = float(weight @ means)
         variance = values.var(axis=0) + float(weight @ ((values - mean) ** 2).mean(axis=0)) / distinct
         error = float((weight**2 * variance / distinct).sum()) * RECORD_EXCESS
         error += float((doubt * (means - mean) ** 2).sum()) / hit.sum() ** 2
+        # light so rare that no record need be of it, by exp(-SIGMAS^2 / 2), has no variance here
+        error += (0.5 * SIGMAS * reach * float((weight / distinct).max())) ** 2
         slack = SIGMAS * math.sqrt(error) + t.noise(statistic) + ROUNDING
         slack += 2.0 * (unlit + t.dropped) * float(np.abs(values).max())
         pointer, what = f"/blocks/{place[f'memory_{name}']}", f"the mean of memory_{name}"

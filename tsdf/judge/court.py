@@ -175,11 +175,14 @@ class Subject:
     def variation_allowance(self, truth: np.ndarray) -> float:
         """Return the total variation to the truth that the stated noise explains.
 
-        It states the mean; the sum of the columns' absolute errors scatters about it the less the more columns
-        take part. A column that no path has reached does not show in it, but holds less than ten paths' light.
+        It states the mean; the sum of the columns' absolute errors scatters about it the less the more columns take
+        part, of which one less is free, for they sum to 1; where one alone is, SIGMAS of it are allowed. A column no
+        path has reached does not show in it, but holds less than ten paths' light.
         """
         error, paths = self.column_errors, self.header["provenance"]["paths"]
         noise = self.header["table_error"]["sampling_noise"]
-        scatter = math.sqrt(math.pi / 2.0 - 1.0) * math.sqrt((error**2).sum()) / max(error.sum(), 1e-300)
+        free = max(error.sum() ** 2 / max((error**2).sum(), 1e-300) - 1.0, 1.0)
+        scatter = SIGMAS * math.sqrt(math.pi / 2.0 - 1.0)  # of the size of a normal error, over its mean
+        beyond = scatter / math.sqrt(free) + (SIGMAS * math.sqrt(math.pi / 2.0) - 1.0 - scatter) / free
         unseen = np.minimum(truth, 10.0 / paths)[self.p == 0.0].sum() if paths else 0.0
-        return float(noise * (1.0 + SIGMAS * scatter) + unseen + ROUNDING)
+        return float(noise * (1.0 + beyond) + unseen + ROUNDING)

@@ -229,13 +229,13 @@ class Setting:
         """Return the sphere that sends all light back from its surface."""
         return self.traced("sphere", 1e9)
 
-    def traced(self, name: str, eta: float, paths: int = 200_000, **parameters: float) -> Table:
+    def traced(self, name: str, eta: float, paths: int = 200_000, **parameters: Any) -> Table:
         """Return the table of a traced grain."""
 
         def make() -> Table:
             from tsdf.make.scatterometer import Build
 
-            grain = tsdf.load_grain(name, **parameters)
+            grain = tsdf.load_grain(name, repair=False, **parameters)
             built = Build.start(grain, tsdf.Optics(eta), tsdf.Effort(paths, cells=128, joint=16, memory=64))
             built.run(grain, self.threads or 2)
             return built.table()

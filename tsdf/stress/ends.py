@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from tsdf.data.table import Table
 from tsdf.picture import render
 from tsdf.picture.trust import Moments
-from tsdf.picture.world import build
+from tsdf.picture.world import World, build
 from tsdf.scene.levels import LEVELS
 from tsdf.scene.medium import Component, volume_parameters
 from tsdf.scene.scene import Absorption, Camera, ConstantLight, GrainSpec, MediumSpec, Render, Scene, Slab, Sphere
@@ -29,7 +29,7 @@ from tsdf.stress.cells import (
     mean_of,
     relative,
 )
-from tsdf.study.experiment import Experiment, gather, scene_of, slab_experiment
+from tsdf.study.experiment import Ends, follow, gather, scene_of, slab_experiment
 
 GROUP = "Ends of paths"
 F = 0.6
@@ -90,18 +90,10 @@ def variances(setting: Setting) -> Iterator[Measured]:
     for method in ("isotropic", LEAPS):
         level, leap, _ = level_of(method)
         one = slab_experiment(level, GrainSpec(setting.ball), F, THICK, leap=leap)
-        read: list[np.ndarray] = []
-
-        def light(places: np.ndarray, ends: object, read: list[np.ndarray] = read) -> np.ndarray:
-            read.append(ends.weight.copy())  # type: ignore[attr-defined]
-            return read[-1][:, None]
-
-        gather(Experiment(one.world, one.camera, 1, light), paths, None, setting.seed, setting.threads)
-        yield told(method, np.concatenate(read))
-    for number, (method, end) in enumerate(CAPS[:1]):
-        yield told(
-            method, naive.isotropic_slab(isotropic_thickness(setting), 1.0, paths, setting.rng(24 + number), end).weight
-        )
+        _, ends = follow(one.world, one.camera, paths, setting.seed, threads=setting.threads)
+        yield told(method, ends.weight)
+    light = naive.isotropic_slab(isotropic_thickness(setting), 1.0, paths, setting.rng(24), naive.capped).weight
+    yield told("capped roulette", light)
 
 
 def absorbing(table: Table, albedo: float) -> float:
@@ -158,9 +150,8 @@ def leaps(setting: Setting) -> Iterator[Measured]:
             one.world.leaps.middle[:] = 0.0
         world = one.world
 
-        def left(places: np.ndarray, ends: object, world: object = world) -> np.ndarray:
-            light = ends.weight * np.exp(ends.amounts @ world.absorption.rgb[0])  # type: ignore[attr-defined]
-            return np.asarray(light)[:, None]
+        def left(places: np.ndarray, ends: Ends, world: World = world) -> np.ndarray:
+            return np.asarray(ends.weight * np.exp(ends.amounts @ world.absorption.rgb[0]))[:, None]
 
         sums = gather(replace(one, read=left), paths, None, setting.seed + number, setting.threads)
         found[leap] = (float(sums.mean[0]), float(sums.error[0]))

@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+import re
 import textwrap
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -142,8 +143,17 @@ def markdown(report: Report) -> str:
             cells = [_marked(by[method]) if method in by else "" for method in ours]
             rest = "<br>".join(f"{method}: {_marked(cell)}" for method, cell in by.items() if method not in OURS)
             lines.append(f"| {one.row.title} | {about(one.row)} | {' | '.join(cells)} | {rest} |")
-        lines.append("")
+        lines += ["", *(f"- {one.row.title}: {'; '.join(said)}." for one in some if (said := _noted(one))), ""]
     return "\n".join(lines)
+
+
+def _noted(one: Done) -> list[str]:
+    """Return what was noted beside figures, each note once, with the methods that it is of."""
+    notes: dict[str, list[str]] = {}
+    for cell in one.cells:
+        if cell.measured.note and cell.verdict != TRUTH:
+            notes.setdefault(cell.measured.note, []).append(cell.measured.method)
+    return [f"{', '.join(methods)}: {note}" for note, methods in notes.items()]
 
 
 def _marked(cell: Cell) -> str:
@@ -168,7 +178,8 @@ def notes(report: Report) -> list[str]:
             unit = one.row.unit.replace("1", "")
             said = ", ".join(f"`{m.method}` {figure(m.value, m.error)} {unit}".rstrip() for m in bad)
             file, _, section = known.partition(", ")
-            where = f"[{section}]({file})" if known else "**claimed to hold**"
+            anchor = re.sub(r"[^\w\- ]", "", section.lower()).replace(" ", "-")
+            where = f"[{section}]({file}#{anchor})" if known else "**claimed to hold**"
             lines.append(
                 f"- {one.row.title}, {one.row.figure}: {said} ({where}). " + f"Holds: {', '.join(good) or 'none'}."
             )

@@ -36,6 +36,7 @@ LEAST_RUNS, MOST_RUNS = 2, 1000
 TRIAL = 0.1  # share of a run's time after which a trial says how many samples it can have
 DOUBLINGS = 4  # of the samples of a run, at which its error is measured
 LEAST_SAMPLES = 2  # of a pixel, for one has no variance
+MOST_PIXELS = 20_000_000  # of all pictures, which are in memory until the end: a gigabyte
 UNSURE = 0.2  # relative noise of the truth's pixels in a run, from which on the user is told
 LARGEST_SEED = 2**63
 
@@ -221,9 +222,17 @@ def measure(
     notes: list[str] = []
     told(0.0, "reading the scene")
     truth = _truth(scene, notes)
-    ways = _possible(scene, candidates() if chosen is None else chosen, truth, notes, told)
+    ways = _possible(scene, candidates() if chosen is None else chosen, truth, notes, told, stop)
+    if stop.is_set():
+        return None
     if not sees(truth.world):
         raise UsageError(f"{scene.name}: a camera looking at nothing: it sees neither a medium nor a surface")
+    pixels, pictures = scene.camera.width * scene.camera.height, runs * (1 + len(ways))
+    if pixels * pictures > MOST_PIXELS:
+        raise UsageError(
+            f"{scene.name}: {pictures} pictures of {scene.camera.width} x {scene.camera.height} pixels do not fit into "
+            "memory; give a smaller --width, which is sooner as well"
+        )
     told(0.0, "trying how long samples take")
     each = seconds / runs
     for way in (truth, *ways):
@@ -326,12 +335,15 @@ def _truth(scene: Scene, notes: list[str]) -> Way:
 
 
 def _possible(
-    scene: Scene, chosen: Sequence[Candidate], truth: Way, notes: list[str], told: Callable[[float, str], None]
-) -> list[Way]:
+    scene: Scene, chosen: Sequence[Candidate], truth: Way, notes: list[str], told: Callable[[float, str], None],
+    stop: threading.Event,
+) -> list[Way]:  # fmt: skip
     """Return the candidates that are possible; why the others are not goes to the notes, once for each reason."""
     ways: list[Way] = []
     failed: dict[str, list[str]] = {}
     for candidate in chosen:
+        if stop.is_set():
+            return ways
         told(0.0, f"making {candidate} ready")
         try:
             world = truth.world

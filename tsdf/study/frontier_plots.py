@@ -145,7 +145,7 @@ def _against_bytes(axes: Any, frontier: Frontier) -> None:
             )  # fmt: skip
         else:
             axes.errorbar(
-                kilobytes, high, 0.25 * high, fmt="none", uplims=True, capsize=3, elinewidth=0.8, ecolor=level.colour
+                kilobytes, high, 0.25 * high, fmt="none", uplims=True, capsize=3, elinewidth=0.8, color=level.colour
             )
         shown += [high, max(low, 0.5 * high) if row.floor.seen else 0.7 * high]
     if shown:
