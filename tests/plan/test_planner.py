@@ -143,6 +143,21 @@ def test_tables_without_records(tmp_path: Path) -> None:
     assert "no records by entry" in need and "--memory 64" in need
 
 
+def test_where_there_is_no_truth(ball: tsdf.Table) -> None:
+    """No random packing is as dense as 0.7, so nothing is explicit: another level stands for the truth, that is said,
+    and none claims to be without error. Nor is it piloted where a path meets millions of grains."""
+    made = plan(pile(ball, 160.0, 0.7), 0.1, threads=2)
+    assert any(note.startswith("no level explicit here") for note in made.notes)
+    assert {p.candidate.level for p in made.predictions} >= {"teleport", "volume"}
+    assert all(p.floor.value > 0.0 and not p.candidate.explicit_grains for p in made.predictions)
+    deep = pile(ball, 160.0)
+    box = Box((-1e5, -1e5, -1e5), (1e5, 1e5, 0.0))
+    deep = replace(deep, media=(replace(deep.media[0], shape=box),))
+    made = plan(deep, 0.1, threads=2)
+    assert any("cannot be piloted" in note for note in made.notes) and not of(made, "explicit").piloted
+    assert made.chosen.candidate.level != "explicit" and made.chosen.floor.high < 0.1
+
+
 @pytest.mark.parametrize("target", [0.0, -0.1, 1.0, math.nan, math.inf])
 def test_bad_targets(ball: tsdf.Table, target: float) -> None:
     with pytest.raises(UsageError, match="target is an error of pixels") as refused:

@@ -126,6 +126,8 @@ class _Planning:
         self.pilots: dict[Candidate, Pilot] = {}
         self.reference: Candidate | None = None
         self.impossible: dict[str, TSDFError] = {}
+        self.refused: set[Candidate] = set()  # what no world can be built of
+        self.dear = False  # whether single grains cannot be piloted
         self.explicit_sample = math.inf  # [s] of one thread, where it is not piloted
 
     def plan(self) -> Plan:
@@ -143,8 +145,14 @@ class _Planning:
         found = self.predictions()
         self.weigh()
         chosen = self.choose(found)
-        while chosen.candidate not in self.pilots and self.add(chosen.candidate):  # none is taken unseen
-            self.round(CHECK * self.budget, [chosen.candidate])
+        while chosen.candidate not in self.pilots:  # none is taken unseen
+            one = chosen.candidate
+            if self.dear and LEVELS[one.level].traits.packed:
+                if self.possible(one) is not None:
+                    break
+            elif self.add(one):
+                self.round(CHECK * self.budget, [one])
+            self.refused |= {one} - set(self.pilots)
             found = self.predictions()
             chosen = self.choose(found)
         rest = sorted((p for p in found if p is not chosen), key=lambda p: (p.safe_seconds(self.target), p.floor.value))
@@ -231,9 +239,9 @@ class _Planning:
         each = self.met() * EVENT_S[facets]
         able = TURN * self.budget * self.threads / max(HALVES * each, 1e-12)  # pixels
         self.looked_at = int(min(max(able, FEWEST), PIXELS))
-        dear = able < TURN * FEWEST
+        self.dear = able < TURN * FEWEST and bool(self.bodies)
         for level in LEVELS:
-            if LEVELS[level].traits.packed and dear and self.bodies:
+            if LEVELS[level].traits.packed and self.dear:
                 if level == "explicit":
                     self.notes.append(
                         f"light meets {self.met():.2g} grains on its way, so that level explicit cannot be piloted in "
@@ -315,7 +323,9 @@ class _Planning:
         return [
             self.predicted(one)
             for one in candidates(tuple(LEVELS), GRAINS)
-            if one.level not in self.impossible and not (one.explicit_grains and "explicit" in self.impossible)
+            if one.level not in self.impossible
+            and one not in self.refused
+            and not (one.explicit_grains and "explicit" in self.impossible)
         ]
 
     def trusted(self, pilot: Pilot) -> bool:
