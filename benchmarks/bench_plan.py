@@ -150,13 +150,14 @@ def photographed(
     return picture, time.process_time() - began
 
 
-def measured(scene: Scene, truth_s: float, each_s: float) -> dict[Candidate, Measured]:
+def measured(scene: Scene, truth_s: float, each_s: float, others: set[Candidate]) -> dict[Candidate, Measured]:
     places: dict[bool, Place] = {}
     truth, processor = photographed(scene, Candidate("explicit"), truth_s, 1, places)
     found = {Candidate("explicit"): Measured(truth, truth, processor)}
     found[Candidate("explicit")].square = 0.0
     for number, one in enumerate(candidates(grains=GRAINS)):
-        if one.level in ("explicit", "teleport-joint") or (one.level == "teleport" and one.explicit_grains):
+        usual = one.level not in ("explicit", "teleport-joint") and (one.level != "teleport" or not one.explicit_grains)
+        if not usual and (one not in others or one.level == "explicit"):
             continue
         picture, processor = photographed(scene, one, each_s, 2 + number, places)
         found[one] = Measured(picture, truth, processor)
@@ -200,7 +201,7 @@ def main() -> None:
                 continue
             scene = parse(data, name=name)
             plans = [(target, plan(scene, target, threads=THREADS)) for target in targets]
-            found = measured(scene, args.truth, args.each)
+            found = measured(scene, args.truth, args.each, {one.chosen.candidate for _, one in plans})
             for target, one in plans:
                 row = {"scene": name, **judged(one, found, target)}
                 rows.append(row)

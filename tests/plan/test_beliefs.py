@@ -44,6 +44,8 @@ def test_the_atlas_says_what_the_documents_say() -> None:
     assert prior.slab_error("teleport", dilute)[0] < 0.4 * off
     mirrors = prior.Body(0.6, 0.89, 0.0, 1.0, 10.0, whole=False)
     assert prior.slab_error("teleport-memory", mirrors)[0] > 2.0 * prior.slab_error("teleport-packed", mirrors)[0]
+    thick = [prior.slab_error("teleport", SPHERES._replace(thickness=t))[0] for t in (40.0, 400.0)]
+    assert thick[1] == pytest.approx(thick[0] * (1.0 + 30.0 / 10.2) / (1.0 + 300.0 / 10.2), rel=0.01)
     assert prior.slab_error("explicit", SPHERES) == (0.0, True)
     for level in LEVELS:
         assert 0.0 <= prior.slab_error(level, SPHERES._replace(albedo=0.95))[0] < 0.5

@@ -119,7 +119,7 @@ def test_other_wishes_other_choices(far: Plan, ball: tsdf.Table) -> None:
     assert p.noise(4.0) == pytest.approx(0.5 * p.noise(1.0)) and p.error(p.seconds(0.03)) == pytest.approx(0.03)
     hurried = plan(pile(ball, 160.0), 0.002, seconds=0.5, threads=2)
     assert "least" in hurried.why[0]
-    errors = [math.hypot(p.floor.high, p.noise(0.5 / 1.0)) for p in hurried.predictions]
+    errors = [math.hypot(p.floor.high, p.noise(0.5 / hurried.load)) for p in hurried.predictions]
     assert errors[0] <= 1.3 * min(errors)
 
 

@@ -62,6 +62,7 @@ class Pilot:
         self.sums, self.squares = np.zeros((HALVES, n, 3)), np.zeros((HALVES, n, 3))
         self.each = 0  # samples of a pixel in each half
         self.busy, self.wall = 0.0, 0.0  # [s] of all threads together; on the clock
+        self.timed, self.timed_samples, self.largest = 0.0, 0, 0  # [s] of the largest portions, whose start is no part
         self._walkers: list[Walkers] = []
 
     def warm(self) -> None:
@@ -101,11 +102,15 @@ class Pilot:
             free.append(mine)
             return half, radiance, spent
 
+        if each > 2 * self.largest:
+            self.timed, self.timed_samples, self.largest = 0.0, 0, each
         with ThreadPoolExecutor(self.threads) as pool:
             for half, radiance, spent in pool.map(work, jobs):
                 self.sums[half] += radiance.sum(axis=1)
                 self.squares[half] += (radiance**2).sum(axis=1)
                 self.busy += spent
+                if 2 * each > self.largest:
+                    self.timed, self.timed_samples = self.timed + spent, self.timed_samples + radiance[..., 0].size
         self.each += self.threads * each
 
     @property
@@ -118,7 +123,9 @@ class Pilot:
         grey = float(variance.mean())
         events = sum(int(one.counters[0]) for one in self._walkers)
         error = math.sqrt(grey / (count * n)) / mean
-        return Seen(mean, error, grey / mean**2, self.busy / (count * n), events / (count * n), count * n)
+        return Seen(
+            mean, error, grey / mean**2, self.timed / max(self.timed_samples, 1), events / (count * n), count * n
+        )
 
     def pixel_means(self, half: int) -> np.ndarray:
         """Mean radiance of each pixel (n, 3) in one half."""

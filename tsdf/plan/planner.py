@@ -45,6 +45,8 @@ CHECK = 0.1  # of the time for a look at what is chosen and was not seen
 NEAR = 3.0  # times as long as the best as a candidate may seem to take to be looked at again
 EVENT_S = (1.0e-6, 5.0e-6)  # [s] of one explicit grain, an exact sphere and one of facets, about
 MEETINGS = 30.0  # of lights that are met by chance alone, that a pilot is believed from on
+LEAST_PER_E = 2.0  # explicit grains of facets that bring texture down by e, at least
+TIE = 1.1  # times as long as the cheapest as it may take, of those the one with the least error is taken
 ALIKE = 0.2  # of the logarithm of an error, what two levels of teleportation may differ by
 BUSY = 1.5  # times as long as on processors that have nothing else to do, from which on it is said
 LEAST = 1e-4  # [1] of an error
@@ -152,7 +154,7 @@ class _Planning:
         )
         made = Plan(
             self.asked, self.target, self.seconds, (chosen, *rest), far, (), tuple(lacking), tuple(self.notes),
-            self.spent, self.threads,
+            self.spent, self.threads, self.load,
         )  # fmt: skip
         return replace(made, why=why(made, self.bodies, self.footprint, self.coverage, str(self.reference)))
 
@@ -285,6 +287,12 @@ class _Planning:
                 f"processors are busy with other things: now everything takes {self.load:.1f} times as long"
             )
 
+        if self.reference is not None and not self.trusted(self.pilots[self.reference]):
+            self.notes.append(
+                "single grains meet suns and small bright lights by chance alone, too seldom for pilots: errors are "
+                "what is expected of slabs, and levels that aim at lights are the safer choice"
+            )
+
     def finalists(self) -> list[Candidate]:
         """Return the candidates that may be the best, of which pilots are worth their time."""
         found = self.predictions()
@@ -362,17 +370,22 @@ class _Planning:
         return bias, bias_error, beliefs.of_square(size, spread, square, error), one.known or apart is not None
 
     def missed(self, plain: Candidate) -> tuple[float, float] | None:
-        """Return the texture that all levels without single grains miss alike, by the pilot that knows it best, and
-        the spread of its logarithm; None for levels that have some of it, for that pilot, and where there is none."""
+        """Return the texture that all levels without single grains miss alike, by the one that is believed to have the
+        least error, and the spread of its logarithm; None for that, and for levels that have some of it."""
         alike = [c for c in self.pilots if not c.explicit_grains and not LEVELS[c.level].traits.packed]
         seen = {c: apart for c in alike if (apart := self.apart(c)) is not None}
         if not seen or LEVELS[plain.level].traits.packed:
             return None
-        best = min(seen, key=lambda c: seen[c].square_error)
+        floors = {
+            c: beliefs.of_square(
+                self.expected[c.level].floor, max(self.expected[c.level].spread, 1e-9), a.square, a.square_error
+            )
+            for c, a in seen.items()
+        }
+        best = min(floors, key=lambda c: floors[c].value)
         if best == plain:
             return None
-        one = self.expected[best.level]
-        floor = beliefs.of_square(one.floor, max(one.spread, 1e-9), seen[best].square, seen[best].square_error)
+        floor = floors[best]
         off = min(abs(seen[best].bias), 0.9 * floor.value)
         return max(math.sqrt(floor.value**2 - off**2), LEAST), math.log1p(floor.error / max(floor.value, LEAST))
 
@@ -392,10 +405,22 @@ class _Planning:
         if not k:
             return floor
         off = math.hypot(bias, bias_error)
-        left = math.exp(-k / PER_E)
+        left = math.exp(-k / min(self.per_e, self.length))
         texture = math.sqrt(max(floor.value**2 - off**2, 0.0)) * left
         value = math.hypot(texture, min(off, floor.value))
         return Belief(value, math.hypot(math.hypot(floor.error * left, FADING * texture), 0.5 * min(bias_error, value)))
+
+    @property
+    def per_e(self) -> float:
+        """How many grains bring texture down by e: spheres 4 (docs/hybrid.md), facets as many as forget a direction."""
+        forget = [max(LEAST_PER_E, 1.0 / max(1.0 - body.mean_cosine, 1e-9)) for body in self.bodies if not body.round]
+        return min([PER_E, *forget])
+
+    @property
+    def length(self) -> float:
+        """How many grains light meets that meets any, by the reference: with fewer still to come less can be missed."""
+        assert self.reference is not None
+        return max(self.pilots[self.reference].seen.events / max(self.coverage, 1e-9), 1.0)
 
     def cost(self, candidate: Candidate) -> tuple[Seen, bool]:
         """Return variance and time of a sample, by its pilot or from those of others, and whether it was the former."""
@@ -441,7 +466,8 @@ class _Planning:
             return min(found, key=lambda p: math.hypot(p.floor.high, p.noise(limit)))
         if math.isinf(takes):
             return min(found, key=lambda p: p.floor.high)
-        return best
+        alike = [p for p in found if p.safe_seconds(self.target) <= TIE * takes]
+        return min(alike, key=lambda p: p.floor.high)
 
 
 def loaded(scene: Scene) -> tuple[Scene, list[Table]]:

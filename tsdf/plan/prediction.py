@@ -83,6 +83,8 @@ class Plan:
     spent : float
         Time that planning took, after packings, records and kernels were made [s].
     threads : int
+    load : float
+        How many times as long things take now as they would if processors had nothing else to do.
     """
 
     scene: Scene
@@ -95,10 +97,16 @@ class Plan:
     notes: tuple[str, ...]
     spent: float
     threads: int
+    load: float = 1.0
 
     @property
     def chosen(self) -> Prediction:
         return self.predictions[0]
+
+    @property
+    def able(self) -> float | None:
+        """What of the time the picture has processors for [s]."""
+        return None if self.seconds is None else self.seconds / self.load
 
     @property
     def noise(self) -> float:

@@ -27,7 +27,8 @@ FILE = "level_errors.csv"
 LEAST = 0.003  # [1] that any level but explicit may be off by: packings differ, records are few
 SPREAD = math.log(2.5)  # of the logarithm of an error about what is expected
 THIN = 10.0  # [R] of spheres, whose texture `texture` is; that of thicker ones falls as one over thickness
-DEEP = 0.1  # of it that is left, however thick: light comes from one side
+DEEP = 0.25  # of it that is left at 40 R, and however thick: light comes from one side, and rims stay thin
+FACETED = 1.6  # times the texture of spheres, of grains with facets, which flash
 CLEAR = 1e-3  # co-albedo of a grain that stands for none in logarithms
 BLURRED = 0.3  # share of the texture that packed spheres miss which answer from records; facets miss all
 LEAST_SEEN = 0.05  # share of the picture that grains make, for their light falls on other things
@@ -108,7 +109,8 @@ def slab_error(level: str, body: Body, points: Points | None = None) -> tuple[fl
     """Return by how much a level is off in a slab like a body, over what comes back [1], and whether the atlas has it.
 
     Linear in mean cosine and packing fraction, and in the logarithms of thickness over l* and of co-albedo; beyond the
-    atlas it is what it is at its edge.
+    atlas it is what it is at its edge, but for lossless grains in deeper layers: there it falls as the light that comes
+    through, 1 / (1 + 3/4 thickness / l*).
     """
     p = points or atlas()
     if level == "explicit":
@@ -122,6 +124,8 @@ def slab_error(level: str, body: Body, points: Points | None = None) -> tuple[fl
         for f in range(len(p.packing_fraction)):
             layers = np.log(p.layer / p.transport[g, f])
             by_albedo = [float(np.interp(deep, layers, p.error[level][g, f, :, a])) for a in range(len(p.albedo))]
+            if deep > layers[-1]:
+                by_albedo[-1] *= (1.0 + 0.75 * math.exp(layers[-1])) / (1.0 + 0.75 * math.exp(deep))
             there = np.isfinite(by_albedo[::-1])
             by_fraction.append(float(np.interp(dark, darks[there], np.array(by_albedo[::-1])[there])))
         by_grain.append(float(np.interp(body.packing_fraction, p.packing_fraction, by_fraction)))
@@ -158,7 +162,9 @@ def expected(level: str, body: Body, footprint: float, coverage: float) -> Expec
         optical = body.thickness / body.transport
         slab = math.hypot(slab, FILLS * 2.0 / body.transport / (optical + 4.0 / 3.0))
     grainy = float(texture(footprint)) * max(DEEP, min(1.0, THIN / body.thickness))
-    if traits.answered and body.round:
+    if not body.round:
+        grainy *= FACETED
+    elif traits.answered:
         grainy *= BLURRED
     return Expected(coverage * slab, share * math.hypot(0.5 * slab, grainy), SPREAD if known else 2.0 * SPREAD, known)
 

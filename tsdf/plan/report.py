@@ -49,8 +49,8 @@ def _first(plan: Plan) -> str:
     p = plan.chosen
     far = ", fewer where a pixel covers more" if plan.fewer_far else ""
     takes = p.seconds(plan.target)
-    if plan.seconds is not None and not takes <= plan.seconds:
-        after = f"an error of {percent(p.error(plan.seconds))} after {span(plan.seconds)}"
+    if plan.seconds is not None and plan.able is not None and not takes <= plan.able:
+        after = f"an error of {percent(p.error(plan.able))} after {span(plan.seconds)}"
         met = f"none is sure to meet {percent(plan.target)} in that time, and this one has least"
     elif math.isinf(takes):
         after, met = f"an error of {percent(p.floor.value)} at best", f"none is sure to meet {percent(plan.target)}"
@@ -71,7 +71,7 @@ def _reason(plan: Plan, bodies: Sequence[Body], footprint: float, coverage: floa
     turn = chosen.variance * chosen.turn
     worse = [p for p in plan.predictions[1:] if p.variance * p.turn < turn and p.floor.high > 0.0]
     nearest = min(worse, key=lambda p: p.floor.value, default=None)
-    than = f"; {short(nearest)}, and would take less" if nearest is not None else "; nothing takes less"
+    than = f"; {short(nearest)}, and is faster to the same noise" if nearest is not None else "; nothing takes less"
     return f"because {where}; {short(chosen)}{than}"
 
 
@@ -104,9 +104,9 @@ def _other(plan: Plan) -> str:
 
 def table(plan: Plan) -> list[str]:
     """Return a table of all candidates as lines of text."""
-    after = plan.seconds
+    after = plan.able
     head = ["candidate", "bias %", "texture %", "error at best %", f"time to {percent(plan.target)}"]
-    head += [f"error after {span(after)}"] if after is not None else []
+    head += [f"error after {span(plan.seconds)}"] if plan.seconds is not None else []
     rows = [[*head, "by"]]
     for p in plan.predictions:
         row = [
@@ -133,6 +133,7 @@ def facts(plan: Plan) -> dict[str, Any]:
         "target": plan.target,
         "seconds": plan.seconds,
         "threads": plan.threads,
+        "load": round(plan.load, 2),
         "chosen": chosen_facts(plan),
         "why": list(plan.why),
         "needs": list(plan.needs),
@@ -151,8 +152,8 @@ def facts(plan: Plan) -> dict[str, Any]:
                 "floor_error": p.floor.error,
                 "variance_of_a_sample": p.variance,
                 "seconds_per_sample_of_all_pixels": number(p.turn),
-                "noise": number(p.noise(plan.seconds)) if plan.seconds is not None else None,
-                "error": number(p.error(plan.seconds)) if plan.seconds is not None else None,
+                "noise": number(p.noise(plan.able)) if plan.able is not None else None,
+                "error": number(p.error(plan.able)) if plan.able is not None else None,
                 "seconds_to_target": number(p.seconds(plan.target)),
                 "piloted": p.piloted,
                 "known": p.known,

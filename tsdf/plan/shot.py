@@ -16,8 +16,8 @@ from tsdf.plan.planner import TARGET, plan
 from tsdf.plan.prediction import Plan
 from tsdf.scene.levels import AUTO
 from tsdf.scene.scene import Scene, load, parse, resized
+from tsdf.scene.specs import SPP
 
-SPP = 64  # samples per pixel of a named level, where nothing says when to stop
 BOTH = 2.0**0.5  # times the noise that is asked for, that the whole error may be: no more bias and texture than noise
 
 

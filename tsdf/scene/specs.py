@@ -20,6 +20,7 @@ from tsdf.grain.materials import optical_constants
 UP = ("z", "y")
 INSIDE = ("grains", "centres")
 METRES_PER_NM = 1e-9
+SPP = 64  # samples per pixel, where nothing says when to stop
 Triple = tuple[float, float, float]
 
 
