@@ -42,6 +42,7 @@ from tsdf.scene.scene import (
     called,
 )
 from tsdf.scene.sizes import MATERIAL_DENSITY, InWords, grain_sizes
+from tsdf.scene.specs import SPP
 from tsdf.spheres.packing_table import law
 from tsdf.vectors import frame
 from tsdf.walk.explicit import Packed, nothing_packed, packed
@@ -303,7 +304,7 @@ def build(
         media = media._replace(limit=int(min(max(limit, longest), MOST_EVENTS)))
     notes += _long_paths(scene, [0.0 if there else n for n, there in zip(met, deep, strict=True)])
     notes += said
-    samples = (scene.render.spp or 1) * scene.camera.width * scene.camera.height
+    samples = (scene.render.spp or SPP) * scene.camera.width * scene.camera.height
     if singles and scene.media and lights.sampled and kurtosis_of(lights) > MOST_VOV * samples:
         notes.append(
             f"{scene.name}: {f'level {level} meets' if traits.packed else 'explicit grains meet'} suns and small "
