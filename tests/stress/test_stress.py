@@ -63,8 +63,8 @@ def failing(found: rows.Report) -> dict[str, set[str]]:
 
 @pytest.mark.parametrize(
     ("value", "error", "said"),
-    [(0.0, 0.0, HOLDS), (1.0, 0.3, HOLDS), (1.01, 0.0, FAILS), (-5.0, 1.2, FAILS), (5.0, 1.3, UNSURE),
-     (0.0, 0.4, UNSURE), (math.nan, 0.0, cells.NOT)],
+    [(0.0, 0.0, HOLDS), (0.4, 0.29, HOLDS), (0.9, 0.1, UNSURE), (1.01, 0.0, FAILS), (1.1, 0.1, UNSURE),
+     (-5.0, 1.3, FAILS), (5.0, 1.4, UNSURE), (0.0, 0.6, UNSURE), (math.nan, 0.0, cells.NOT)],
 )  # fmt: skip
 def test_verdicts_follow_from_the_figure(value: float, error: float, said: str) -> None:
     assert verdict(value, error, 1.0) == said
@@ -92,7 +92,7 @@ def test_light_rows() -> None:
     found = rows.measure(rows.chosen(",".join(LIGHT), setting), setting)
     assert not found.broken and not found.notes
     assert all(cell.verdict == HOLDS for one in found.done for cell in one.cells if cell.ours and not cell.known
-               and cell.measured.error * 3.0 <= one.row.limit)  # fmt: skip
+               and cell.measured.error * 5.0 <= one.row.limit)  # fmt: skip
     seen = failing(found)
     assert {name: seen[name] & bad for name, bad in LIGHT.items()} == LIGHT
 
@@ -156,7 +156,7 @@ def made_up(name: str, method: str, value: float, known: dict[str, str] | None =
         (made_up("good", "teleport", 0.1), 0, "holds teleport 0.10(10)"),
         (made_up("bad", "teleport", 5.0), 1, "FAILS though it is claimed to hold: bad, teleport"),
         (made_up("bad", "teleport", 5.0, {"teleport": "memory.md, How right it is"}), 0, "known teleport 5.00(10)"),
-        (made_up("good", "teleport", 0.1, {"teleport": "memory.md, How right it is"}), 0, "does not fail here, though"),
+        (made_up("good", "teleport", 0.1, {"teleport": "memory.md, How right it is"}), 0, "holds here, though"),
         (made_up("bad", "depth cap", 5.0), 0, "FAILS depth cap 5.00(10)"),
     ],
 )  # fmt: skip

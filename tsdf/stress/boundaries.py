@@ -64,9 +64,10 @@ def taken(setting: Setting, whole: Scene, method: str, spp: int) -> Picture:
 
 
 def radiance(method: str, picture: Picture, expected: float) -> Measured:
-    """Return the mean of a picture less what is expected, in per cent of the light."""
+    """Return the mean of a picture less what is expected, in per cent of the light; its error is at least a sample."""
     value = float(picture.rgb[..., 1].mean())
     error = math.sqrt(float(picture.variance[..., 1].sum())) / picture.samples.size
+    error = max(error, 1.0 / float(picture.samples.sum()))
     wrong = picture.faults + picture.truncated
     return Measured(method, 100.0 * (value - expected), 100.0 * error, f"{wrong} given up" if wrong else "")
 

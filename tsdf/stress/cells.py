@@ -20,8 +20,10 @@ from tsdf.scene.levels import LEVELS
 
 HOLDS, FAILS, UNSURE, NOT, TRUTH = "holds", "fails", "cannot tell", "does not apply", "the truth"
 REFUSED = "refused"  # begins a note: nothing was done, and this was said
-SIGMAS = 4.0  # standard errors beyond which a figure above the limit fails
-RESOLVED = 3.0  # standard errors that the limit is at least, where a cell holds
+BEYOND, WITHIN = (
+    3.0,
+    2.0,
+)  # standard errors beyond its limit from which on a figure fails, and within it, where it holds
 
 TRACER, TABLES, HYBRID = "tracer", "tables", "5 explicit"
 LEAPS, VOLUME_LEAPS, ISOTROPIC_LEAPS = "memory + leaps", "volume + leaps", "isotropic + leaps"
@@ -130,8 +132,8 @@ class Row:
 def verdict(value: float, error: float, limit: float) -> str:
     """Return the verdict on a figure that ought to be 0 and may be as large as a limit.
 
-    It fails where it is above the limit and more than 4 standard errors from 0, and holds where it is not above it and
-    the limit is at least 3 standard errors; else nobody can tell.
+    It fails where it is more than 3 standard errors above the limit, and holds where it is 2 below it; else nobody can
+    tell.
 
     Examples
     --------
@@ -140,9 +142,9 @@ def verdict(value: float, error: float, limit: float) -> str:
     """
     if math.isnan(value):
         return NOT
-    if abs(value) > limit:
-        return FAILS if abs(value) > SIGMAS * error else UNSURE
-    return HOLDS if RESOLVED * error <= limit else UNSURE
+    if abs(value) - BEYOND * error > limit:
+        return FAILS
+    return HOLDS if abs(value) + WITHIN * error <= limit else UNSURE
 
 
 def share(method: str, count: float, among: int, note: str = "") -> Measured:

@@ -9,20 +9,7 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from itertools import groupby, zip_longest
 
-from tsdf.stress.cells import (
-    FAILS,
-    HOLDS,
-    NAIVE,
-    NOT,
-    OURS,
-    REFUSED,
-    RESOLVED,
-    SIGMAS,
-    TRUTH,
-    UNSURE,
-    Cell,
-    Row,
-)
+from tsdf.stress.cells import BEYOND, FAILS, HOLDS, NAIVE, NOT, OURS, REFUSED, TRUTH, UNSURE, WITHIN, Cell, Row
 from tsdf.stress.rows import Done, Report
 
 WIDTHS = (38, 38, 38)  # columns of a terminal: the situation, ours, others; with what is between them 120
@@ -34,9 +21,8 @@ FIELDS = ("group", "row", "title", "figure", "unit", "limit", "method", "ours", 
 READING = (
     "A figure ought to be 0: it is a deviation from the truth, a share of light lost or leaked, or a relative "
     "variance. Its standard error stands in brackets behind it, in units of its last digit; none where it is exact.",
-    f"A cell **fails** where the figure is above the row's limit and more than {SIGMAS:g} standard errors from 0; it "
-    f"**holds** where it is not above the limit, and the limit is at least {RESOLVED:g} standard errors; else **?**, "
-    "nobody can tell.",
+    f"A cell **fails** where the figure is more than {BEYOND:g} standard errors above the row's limit, and **holds** "
+    f"where it is {WITHIN:g} below it; else **?**, nobody can tell.",
     "**known** is a failure of ours that is documented, and where; **truth** is what others are held against; **-** "
     "does not apply. No verdict is written down anywhere: each follows from its figure.",
 )
@@ -119,7 +105,7 @@ def summary(report: Report) -> list[str]:
             f"FAILS though it is claimed to hold: {row.name}, {m.method}: {figure(m.value, m.error)}, {about(row)}"
         )
     for row, cell in report.better:
-        lines.append(f"does not fail here, though documented ({cell.known}): {row.name}, {cell.measured.method}")
+        lines.append(f"holds here, though documented to fail ({cell.known}): {row.name}, {cell.measured.method}")
     lines += [f"cannot be measured: {note}" for note in report.notes]
     if report.interrupted:
         lines.append("interrupted: rows that follow are missing")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from tsdf.errors import TSDFError, UsageError
 from tsdf.stress import boundaries, ends, numbers, own, rays, slabs
-from tsdf.stress.cells import FAILS, METHODS, NOT, TRUTH, Cell, Row, Setting, verdict
+from tsdf.stress.cells import FAILS, HOLDS, METHODS, TRUTH, Cell, Row, Setting, verdict
 
 ROWS: tuple[Row, ...] = (*rays.ROWS, *numbers.ROWS, *ends.ROWS, *slabs.ROWS, *boundaries.ROWS, *own.ROWS)
 
@@ -55,9 +55,8 @@ class Report:
 
     @property
     def better(self) -> list[tuple[Row, Cell]]:
-        """Where a method of ours does not fail though it is documented to."""
-        rest = [(one.row, cell) for one in self.done for cell in one.cells if cell.ours and cell.known]
-        return [(row, cell) for row, cell in rest if cell.verdict not in (FAILS, NOT)]
+        """Where a method of ours holds though it is documented to fail."""
+        return [(one.row, c) for one in self.done for c in one.cells if c.ours and c.known and c.verdict == HOLDS]
 
 
 def chosen(names: str | None, setting: Setting) -> list[Row]:

@@ -229,7 +229,7 @@ ROWS = (
         "mirrors and clear spheres, half and half",
         "reflectance",
         "%",
-        4.0,
+        3.0,
         mixture,
         FORGETFUL | {"teleport-memory": BACK},
     ),
