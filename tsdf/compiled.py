@@ -28,11 +28,12 @@ from numba.np import linalg
 from tsdf.files import whole
 
 # Before its first kernel numba looks whether scipy has a BLAS, which takes .15 s to import. It has, and who multiplies
-# matrices in a kernel asks for it again.
-_ensure_blas, linalg.ensure_blas = linalg.ensure_blas, bool
-import numba.np.arraymath  # noqa: E402
+# matrices in a kernel asks for it again. A numba that asks otherwise is left to it.
+if hasattr(linalg, "ensure_blas"):
+    _ensure_blas, linalg.ensure_blas = linalg.ensure_blas, bool
+    import numba.np.arraymath
 
-linalg.ensure_blas = _ensure_blas
+    linalg.ensure_blas = _ensure_blas
 
 PACKAGE = Path(__file__).parent
 _IMPORTS = re.compile(r"^from tsdf((?:\.\w+)*) import\s+([^(\n]+|\([^)]*\))", re.MULTILINE)

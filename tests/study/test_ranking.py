@@ -96,3 +96,15 @@ def test_the_best_and_those_that_may_be_as_good() -> None:
     values = np.array([[5.0], [1.0], [1.05], [9.0]]) + 0.2 * rng.standard_normal((4, RUNS))
     first, others = best(values)
     assert {first, *others} == {1, 2}
+
+
+@pytest.mark.parametrize("count", [2, 5, 12])
+def test_the_best_of_equals_is_not_surely_the_best(count: int) -> None:
+    """Of equal candidates any is called worse in at most 5 % of the repetitions, within 3 standard errors of as many;
+    one that is 3 standard deviations of a run worse than equals, in most."""
+    rng = np.random.default_rng(count)
+    equal = rng.standard_normal((REPEATS, count, RUNS)) + 10.0 * rng.standard_normal((REPEATS, 1, RUNS))
+    wrong = sum(len(best(values)[1]) < count - 1 for values in equal)
+    assert wrong <= 0.05 * REPEATS + 3.0 * math.sqrt(0.05 * 0.95 * REPEATS)
+    equal[:, 0] += 3.0
+    assert np.mean([0 not in best(values)[1] for values in equal]) > 0.9

@@ -21,7 +21,7 @@ from tsdf.data.table import Table
 from tsdf.errors import TSDFError, UsageError
 from tsdf.picture import render
 from tsdf.picture.render import Picture
-from tsdf.picture.world import World, build, camera_of, sees
+from tsdf.picture.world import World, build, sees
 from tsdf.scene.levels import LEVELS
 from tsdf.scene.scene import Scene
 from tsdf.study.candidates import Candidate, candidates, taken
@@ -362,10 +362,7 @@ def _possible(
 
 
 def _shot(world: World, spp: int, seed: int, threads: int | None, stop: threading.Event) -> Picture:
-    camera = world.scene.camera
-    return render.measure(
-        world, camera_of(world), camera.width, camera.height, spp, seed=seed, threads=threads, stop=stop
-    )
+    return render.render(world, spp, seed=seed, threads=threads, stop=stop)
 
 
 def _together(one: Picture, other: Picture) -> Picture:

@@ -137,16 +137,8 @@ def places(count: int, pairs: Sequence[Pair]) -> list[tuple[int, int]]:
 
 
 def best(values: np.ndarray) -> tuple[int, list[int]]:
-    """Return the candidate with the smallest mean of values (candidates, runs), and those that may be as good: of them
-    all it is not surely the better, by Holm's rule."""
+    """Return the candidate with the smallest mean of values (candidates, runs), and those that may be as good: all that
+    it is not told apart from when all pairs are ranked, for which is the smallest is known from the same runs."""
     first = int(values.mean(axis=1).argmin())
-    runs, others = values.shape[1], []
-    for k in range(len(values)):
-        value, error = mean_of(values[k] - values[first])
-        if k != first:
-            others.append((float(stdtr(runs - 1, -value / error)) if error > 0.0 else float(value <= 0.0), k))
-    others.sort()
-    for n, (chance, _) in enumerate(others):
-        if chance > (1.0 - CONFIDENCE) / (len(others) - n):
-            return first, sorted(k for _, k in others[n:])
-    return first, []
+    told = {pair.worse for pair in ranked(values) if pair.resolved and pair.better == first}
+    return first, [k for k in range(len(values)) if k != first and k not in told]
