@@ -32,6 +32,22 @@ def test_belief() -> None:
     assert beliefs.of_bias(0.02) == (0.0, 0.02)
 
 
+@pytest.mark.parametrize("spread", [prior.SPREAD, 2.0 * prior.SPREAD])
+@pytest.mark.parametrize("relative", [0.01, 0.03, 0.06, 0.3])
+def test_beliefs_are_calibrated(spread: float, relative: float) -> None:
+    """The truth, drawn from what is expected, lies within two stated errors of what is believed about as often as two
+    standard deviations have it, 95.4 %, however sharp the measurement is, and is not stated much too wide either."""
+    rng = np.random.default_rng(5)
+    truth = 0.05 * np.exp(spread * rng.standard_normal(2000))
+    seen = truth**2 * (1.0 + relative * rng.standard_normal(len(truth)))
+    found = np.array([
+        beliefs.of_square(0.05, spread, q, relative * t**2) for t, q in zip(truth.tolist(), seen.tolist(), strict=True)
+    ])  # fmt: skip
+    inside = (abs(found[:, 0] - truth) <= 2.0 * found[:, 1]).mean()
+    assert 0.93 < inside < 0.98, inside
+    assert np.median(found[:, 1] / truth) == pytest.approx(0.5 * relative, rel=0.15)  # of a root
+
+
 def test_the_atlas_says_what_the_documents_say() -> None:
     """Slabs of 10 R of packed spheres, f = 0.6 (docs/memory.md): teleport is off by 3.1 % along the normal and 14.1 %
     at 60 degrees, teleport-memory by nothing that is seen; a dense slab has no small error at teleport, a dilute one
