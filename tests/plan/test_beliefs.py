@@ -1,6 +1,9 @@
 """What is expected and what is measured as one number; the atlas of level errors; what tables need."""
 
+import csv
 import math
+from importlib import resources
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -65,6 +68,26 @@ def test_the_atlas_says_what_the_documents_say() -> None:
     assert prior.slab_error("explicit", SPHERES) == (0.0, True)
     for level in LEVELS:
         assert 0.0 <= prior.slab_error(level, SPHERES._replace(albedo=0.95))[0] < 0.5
+
+
+def test_an_atlas_of_noise_is_an_atlas_of_no_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Deviations that are their standard errors times normal numbers come out as no error as often as not: the noise is
+    taken off their mean, not off each, where what is left could only be positive."""
+    path, rng = tmp_path / "noise.csv", np.random.default_rng(2)
+    with (resources.files("tsdf.reference_data") / prior.FILE).open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    for row in rows:
+        for name in ("reflectance", "transmittance"):
+            row[f"{name}_deviation"], row[f"{name}_deviation_error"] = 0.1 * rng.standard_normal(), 0.1
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    monkeypatch.setattr(prior, "FILE", str(path))
+    for level, error in prior.atlas.__wrapped__().error.items():
+        found = error[np.isfinite(error)]
+        assert (found == prior.LEAST).mean() > 0.45, level
+        assert found.max() > prior.LEAST
 
 
 def test_the_atlas_is_between_its_neighbours() -> None:
