@@ -1,5 +1,6 @@
 """Plans as a whole, with short pilots: what they must not say, what they refuse, and how they reach pictures."""
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 import tsdf
-from tsdf.errors import UsageError
+from tsdf.errors import SceneError, UsageError
 from tsdf.picture import render, world
 from tsdf.plan import planner, report, shot
 from tsdf.plan.beliefs import CERTAIN, Belief
@@ -16,6 +17,7 @@ from tsdf.plan.pilot import Pilot
 from tsdf.plan.planner import plan
 from tsdf.plan.prediction import Plan, Prediction
 from tsdf.reference_data.make_checks import CHECKS
+from tsdf.scene.levels import LEVELS
 from tsdf.scene.scene import (
     Box,
     Camera,
@@ -128,6 +130,46 @@ def test_only_the_camera_matters_to_scenes_without_grains() -> None:
     scene = Scene(Camera((0.0, -9.0, 9.0), (0.0, 0.0, 0.0), 8, 6), LIGHTS, (), (floor,))
     made = plan(scene, 0.05, threads=1)
     assert made.chosen.floor == CERTAIN and "no grains" in made.why[1]
+
+
+SUN = SunLight((0.6, 0.0, 0.8), (3.0, 3.0, 3.0), 0.53)
+
+
+@pytest.mark.parametrize("sky", [0.1, 0.0])
+def test_a_small_sun_is_left_to_levels_that_aim_at_it(ball: tsdf.Table, sky: float) -> None:
+    """Single grains meet it once in 200,000 times; until then explicit is dark, or black, with no noise at all, and
+    would be taken. So it is not, and the picture is as bright as an explicit one under a sun as strong but wide."""
+    lights = (SUN, ConstantLight((sky,) * 3)) if sky else (SUN,)
+    scene = replace(pile(ball, 9.0), lights=lights)
+    made = plan(scene, 0.05, threads=2)
+    one = made.chosen.candidate
+    assert not one.explicit_grains and not LEVELS[one.level].traits.packed
+    assert any("levels that aim at lights" in note for note in made.notes)
+    assert math.isfinite(made.chosen.variance) and math.isinf(of(made, "explicit").variance)
+    assert f"{made.chosen.candidate}" in made.why[0] and json.dumps(report.facts(made), allow_nan=False)
+    assert report.table(made)[1].startswith(str(one)) and any("not known" in line for line in report.table(made))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("warnings.warn", lambda *_, **__: None)
+        patch.setattr(shot, "plan", lambda *_: made)
+        found = tsdf.render(scene, target_error=0.1, threads=2)
+        wide = replace(scene, lights=(replace(SUN, angular_diameter_deg=15.0), *lights[1:]))
+        truth = tsdf.render(wide, "explicit", spp=1500, threads=2)
+    assert found.rgb.mean() == pytest.approx(truth.rgb.mean(), rel=0.15)  # the level's bias and truth's noise of 3 %
+
+
+def test_where_there_is_nothing_to_see(ball: tsdf.Table) -> None:
+    """Black scenes are planned, and nothing is said to be known of their noise; so are scenes without
+    grains, or with none in sight. Those without light are refused."""
+    with pytest.raises(SceneError, match="a scene without light"):
+        plan(replace(pile(ball, 160.0), lights=()), 0.05)
+    away = replace(pile(ball, 160.0).camera, target=(0.0, -999.0, 999.0))
+    made = plan(replace(pile(ball, 160.0), camera=away), 0.05, threads=2)
+    assert len(made.why) == 3 and math.isfinite(made.chosen.variance)
+    black = plan(replace(pile(ball, 160.0), camera=away, lights=(SUN,)), 0.05, threads=2)
+    assert any("no pilot has seen any light" in note for note in black.notes)
+    assert "nothing is known of its noise" in black.why[0] and json.dumps(report.facts(black), allow_nan=False)
+    for lights in (LIGHTS, (SUN,)):
+        assert plan(Scene(away, lights, ()), 0.05, threads=1).why[0].startswith("take ")
 
 
 def test_tables_without_records(tmp_path: Path) -> None:

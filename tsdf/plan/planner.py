@@ -44,7 +44,8 @@ LATEST = 0.7  # of the time, after which nothing more is made ready for the seco
 CHECK = 0.1  # of the time for a look at what is chosen and was not seen
 NEAR = 3.0  # times as long as the best as a candidate may seem to take to be looked at again
 EVENT_S = (1.0e-6, 5.0e-6)  # [s] of one explicit grain, an exact sphere and one of facets, about
-MEETINGS = 30.0  # of lights that are met by chance alone, that a pilot is believed from on
+MEETINGS = 400.0  # of lights that are met by chance alone, that a pilot is believed from on: its mean, and what others
+# differ from it by, is known to a twentieth then, and the error bar of that to as much
 LEAST_PER_E = 2.0  # explicit grains of facets that bring texture down by e, at least
 TIE = 1.1  # times as long as the cheapest as it may take, of those the one with the least error is taken
 ALIKE = 0.2  # of the logarithm of an error, what two levels of teleportation may differ by
@@ -174,7 +175,7 @@ class _Planning:
         world = build(self.scene, "volume", leap=0.0, places=self.places)
         self.bodies = prior.bodies(world, self.tables)
         self.footprint, self.coverage, self.ratio = prior.looks(world)
-        self.chance = kurtosis_of(world.lights) if world.lights.sampled else 0.0
+        self.chance = kurtosis_of(world.lights) if world.lights.sampled and self.bodies else 0.0
         camera = self.scene.camera
         self.pixels = camera.width * camera.height
         self.expected = {level: self.foreseen(level) for level in LEVELS}
@@ -294,11 +295,14 @@ class _Planning:
             self.notes.append(
                 f"processors are busy with other things: now everything takes {self.load:.1f} times as long"
             )
-
-        if self.reference is not None and not self.trusted(self.pilots[self.reference]):
+        assert self.reference is not None
+        if not any(pilot.seen.mean > 0.0 for pilot in self.pilots.values()):
+            self.notes.append("no pilot has seen any light: nothing is known of noise, and all errors are expected ones")
+        elif any(map(self.hidden, candidates(tuple(LEVELS), GRAINS))):
             self.notes.append(
-                "single grains meet suns and small bright lights by chance alone, too seldom for pilots: errors are "
-                "what is expected of slabs, and levels that aim at lights are the safer choice"
+                "single grains meet suns and small bright lights by chance alone, too seldom for pilots: what explicit "
+                "grains take is not known and they are left out for levels that aim at lights, of which errors are what "
+                "is expected of slabs; a wider sun brings them back"
             )
 
     def finalists(self) -> list[Candidate]:
@@ -329,8 +333,23 @@ class _Planning:
         ]
 
     def trusted(self, pilot: Pilot) -> bool:
-        """Return whether a pilot has met the lights that only chance finds often enough to be believed."""
-        return not (self.chance and pilot.world.media.singles) or pilot.seen.samples / self.chance > MEETINGS
+        """Return whether a pilot has seen any light, and met what only chance finds of it often enough to be believed."""
+        if not pilot.seen.mean > 0.0:
+            return False
+        return not (self.chance and pilot.world.media.singles) or self.often(pilot)
+
+    def often(self, pilot: Pilot) -> bool:
+        """Return whether so many samples as a pilot has are enough for lights that are met by chance alone."""
+        return not self.chance or pilot.seen.samples * self.coverage / self.chance > MEETINGS
+
+    def hidden(self, candidate: Candidate) -> bool:
+        """Return whether a candidate's single grains meet lights too seldom for its variance to be known: by the pilot
+        of the reference, if that has single grains, or else by its own or one of as many samples as the reference's."""
+        assert self.reference is not None
+        if not _singly(candidate):
+            return False
+        best = self.pilots[self.reference]
+        return not self.often(best if _singly(self.reference) else self.pilots.get(candidate, best))
 
     def apart(self, candidate: Candidate) -> Apart | None:
         """Return how a candidate differs from the reference as far as that is known."""
@@ -437,6 +456,9 @@ class _Planning:
         own = self.pilots.get(candidate)
         assert self.reference is not None
         best = self.pilots[self.reference].seen
+        if self.hidden(candidate):
+            seen = own.seen if own is not None and own.each else best
+            return seen._replace(variance=math.inf), own is not None
         if own is not None and own.each:
             return self.with_suns(own), True
         level, k = candidate.level, candidate.explicit_grains
@@ -465,7 +487,8 @@ class _Planning:
 
     def choose(self, found: list[Prediction]) -> Prediction:
         """Return the cheapest that is sure enough to meet the target; if there is a time and none does, the one with
-        the least error in it."""
+        the least error in it. None is taken of whose noise nothing is known, unless nothing is of any."""
+        found = [p for p in found if math.isfinite(p.variance)] or found
         if self.spp is not None:
             fit = [p for p in found if p.floor.high < self.target]
             return min(fit, key=lambda p: p.turn) if fit else min(found, key=lambda p: p.floor.high)
@@ -478,6 +501,11 @@ class _Planning:
             return min(found, key=lambda p: p.floor.high)
         alike = [p for p in found if p.safe_seconds(self.target) <= TIE * takes]
         return min(alike, key=lambda p: p.floor.high)
+
+
+def _singly(candidate: Candidate) -> bool:
+    """Return whether a candidate meets single grains, whose light is met by chance."""
+    return candidate.explicit_grains > 0 or LEVELS[candidate.level].traits.packed
 
 
 def loaded(scene: Scene) -> tuple[Scene, list[Table]]:
