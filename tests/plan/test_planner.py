@@ -232,3 +232,25 @@ def test_without_a_stop_it_is_done_at_the_target(far: Plan, monkeypatch: pytest.
     choice = shot.chosen(far.scene)
     assert (choice.spp, choice.seconds) == (None, None) and choice.target_error is not None
     assert math.hypot(choice.target_error, far.chosen.floor.value) == pytest.approx(far.target)
+
+
+def test_pilots_render_what_is_taken(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where grains look larger in some pixels than in most, explicit ones are fewer elsewhere: so they are in the pilots
+    by which a plan is made. What is left of texture is that of the largest, from when k is enough for them; and that is
+    not more than there is without explicit grains."""
+    slanted = replace(pile(ball, 9.0), camera=Camera((0.0, -11.0, 2.0), (0.0, 12.0, 0.0), 24, 18, fov_deg=60.0))
+    monkeypatch.setattr(planner, "FEWER", 1.1)
+    seen: dict[bool, list[int]] = {True: [], False: []}
+    for far in (True, False):
+        run = planner._Planning(slanted if far else pile(ball, 160.0), 0.05, None, 0, 2)
+        run.look()
+        run.refer()
+        assert run.far == far
+        for k in (0, 8):
+            assert run.add(Candidate("teleport-memory", k))
+            seen[far].append(int(run.pilots[Candidate("teleport-memory", k)].world.met.sum()))
+        whole = Belief(0.4, 0.05)
+        assert run.faded(whole, 0.0, 0.0, 0, 1).value <= 0.4 * (1.0 if far else 0.8)
+        left = run.faded(whole, 0.0, 0.0, 0, 8).value / run.faded(whole, 0.0, 0.0, 8, 16).value
+        assert left == pytest.approx(run.ratio if far else 1.0)
+    assert seen[True][0] == 0 < seen[True][1] and seen[False] == [0, 0]

@@ -119,6 +119,17 @@ class _Planning:
         self.asked, self.target, self.seconds, self.seed, self.threads = scene, target, seconds, seed, threads
         self.told: Callable[[float, str], None] = lambda share, word: None
         self.scene, self.tables = loaded(scene)
+        camera = self.scene.camera
+        self.pixels, self.looked_at = camera.width * camera.height, PIXELS
+        self.named = [
+            (str(spec.table), table)
+            for spec, table in zip((g for m in scene.media for g in m.grains), self.tables, strict=True)
+            if not isinstance(spec.table, Table)
+        ]
+        self.bodies: list[prior.Body] = []
+        self.expected: dict[str, prior.Expected] = {}
+        self.footprint, self.coverage, self.ratio, self.far = math.inf, 0.0, 1.0, False  # see `prior.looks`
+        self.chance = 0.0  # kurtosis of lights that single grains meet by chance
         self.notes: list[str] = []
         self.budget = max(SECONDS, min(SHARE * (seconds or 0.0), MOST_SECONDS))
         self.spp: int | None = None
@@ -157,7 +168,7 @@ class _Planning:
             found = self.predictions()
             chosen = self.choose(found)
         rest = sorted((p for p in found if p is not chosen), key=lambda p: (p.safe_seconds(self.target), p.floor.value))
-        far = bool(chosen.candidate.explicit_grains) and self.ratio > FEWER
+        far = bool(chosen.candidate.explicit_grains) and self.far
         lacking = needs.of_tables(
             list(self.named), self.target, chosen.candidate.level, "explicit" not in self.impossible
         )
@@ -175,15 +186,9 @@ class _Planning:
         world = build(self.scene, "volume", leap=0.0, places=self.places)
         self.bodies = prior.bodies(world, self.tables)
         self.footprint, self.coverage, self.ratio = prior.looks(world)
+        self.far = self.ratio > FEWER
         self.chance = kurtosis_of(world.lights) if world.lights.sampled and self.bodies else 0.0
-        camera = self.scene.camera
-        self.pixels = camera.width * camera.height
         self.expected = {level: self.foreseen(level) for level in LEVELS}
-        self.named = [
-            (str(spec.table), table)
-            for spec, table in zip((g for m in self.asked.media for g in m.grains), self.tables, strict=True)
-            if not isinstance(spec.table, Table)
-        ]
         if not all(one.known for one in self.expected.values()):
             self.notes.append(
                 "the scene lies outside the atlas of level errors: what no pilot has seen is known within a factor of "
@@ -216,6 +221,7 @@ class _Planning:
             return None
         try:
             scene = taken(self.scene, candidate)
+            scene = replace(scene, render=replace(scene.render, fewer_far=self.far and candidate.explicit_grains > 0))
             return build(scene, candidate.level, progress=self.told, places=self.places)
         except (SceneError, UsageError) as error:
             if not candidate.explicit_grains:
@@ -370,18 +376,17 @@ class _Planning:
         base = 0
         for fewer in GRAINS[1:]:  # what is seen of fewer explicit grains says more of this number than none does
             if fewer <= k and (later := self.apart(Candidate(level, fewer))) is not None:
-                floor = self.faded(floor, bias, bias_error, fewer - base)
+                floor = self.faded(floor, bias, bias_error, base, fewer)
                 floor = beliefs.of_square(max(floor.value, LEAST), UNSURE, later.square, later.square_error)
                 bias, bias_error = beliefs.of_bias(max(abs(bias), bias_error), later.bias, later.bias_error)
                 base, known = fewer, True
-        floor = self.faded(floor, bias, bias_error, k - base)
+        floor = self.faded(floor, bias, bias_error, base, k)
         floor = self.beside_the_reference(candidate, floor)
-        texture = math.sqrt(max(floor.value**2 - bias**2, 0.0))
+        texture, most = (math.sqrt(max(value**2 - bias**2, 0.0)) for value in (floor.value, floor.high))
         seen, piloted = self.cost(candidate)
         turn = seen.seconds * self.pixels / self.threads
         return Prediction(
-            candidate, bias, bias_error, texture, min(floor.error, max(texture, floor.error)), floor,
-            seen.variance, turn, piloted, known,
+            candidate, bias, bias_error, texture, most - texture, floor, seen.variance, turn, piloted, known,
         )  # fmt: skip
 
     def without(self, plain: Candidate, one: prior.Expected) -> tuple[float, float, Belief, bool]:
@@ -429,12 +434,15 @@ class _Planning:
             return off
         return Belief(math.hypot(floor.value, off.value), math.hypot(floor.error, off.error))
 
-    def faded(self, floor: Belief, bias: float, bias_error: float, k: int) -> Belief:
-        """Return what is left of a floor after k more explicit grains: its texture falls, its bias does not."""
-        if not k:
+    def faded(self, floor: Belief, bias: float, bias_error: float, before: int, k: int) -> Belief:
+        """Return what is left of a floor with k explicit grains, of one with fewer: its texture falls, its bias does
+        not. Where the first of them go by pixel, all pixels come to what the one is left with that has most."""
+        if k == before:
             return floor
         off = math.hypot(bias, bias_error)
-        left = math.exp(-k / min(self.per_e, self.length))
+        left = math.exp((before - k) / min(self.per_e, self.length))
+        if self.far and not before:
+            left = min(1.0, self.ratio * left)
         texture = math.sqrt(max(floor.value**2 - off**2, 0.0)) * left
         value = math.hypot(texture, min(off, floor.value))
         return Belief(value, math.hypot(math.hypot(floor.error * left, FADING * texture), 0.5 * min(bias_error, value)))
