@@ -13,7 +13,7 @@ from tsdf.errors import SceneError, UsageError
 from tsdf.picture import render, world
 from tsdf.plan import planner, report, shot
 from tsdf.plan.beliefs import CERTAIN, Belief
-from tsdf.plan.pilot import Pilot
+from tsdf.plan.pilot import Apart, Pilot
 from tsdf.plan.planner import plan
 from tsdf.plan.prediction import Plan, Prediction
 from tsdf.reference_data.make_checks import CHECKS
@@ -254,3 +254,39 @@ def test_pilots_render_what_is_taken(ball: tsdf.Table, monkeypatch: pytest.Monke
         left = run.faded(whole, 0.0, 0.0, 0, 8).value / run.faded(whole, 0.0, 0.0, 8, 16).value
         assert left == pytest.approx(run.ratio if far else 1.0)
     assert seen[True][0] == 0 < seen[True][1] and seen[False] == [0, 0]
+
+
+def test_what_levels_miss_alike_is_by_the_best_measured(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of three pilots of one texture the sharpest speaks for the others, not the one that came out least; what is
+    believed of these is no sharper than that, for it is against the same samples."""
+    run = planner._Planning(pile(ball, 160.0), 0.05, None, 0, 2)
+    run.look()
+    run.refer()
+    squares = {"volume": (0.010, 0.004), "teleport": (0.011, 0.0005), "teleport-memory": (0.002, 0.004)}
+    for level in squares:
+        assert run.add(Candidate(level))
+    apart = {Candidate(level): Apart(0.0, 0.001, *square) for level, square in squares.items()}
+    monkeypatch.setattr(planner._Planning, "apart", lambda _, candidate: apart.get(candidate))
+    best = run.without(Candidate("teleport"), run.expected["teleport"])[2]
+    for level in ("volume", "teleport-memory"):
+        missed = run.missed(Candidate(level))
+        assert missed is not None and missed.value == pytest.approx(math.sqrt(0.011), rel=0.02)
+        floor = run.without(Candidate(level), run.expected[level]._replace(bias=0.0))[2]
+        assert floor.value == pytest.approx(math.sqrt(0.011), rel=planner.ALIKE) and floor.error >= 0.99 * best.error
+    assert run.missed(Candidate("teleport")) is None
+
+
+def test_noise_is_over_the_true_mean(ball: tsdf.Table) -> None:
+    """A candidate twice as bright as the reference has four times the variance over the mean of that."""
+    run = planner._Planning(pile(ball, 160.0), 0.05, None, 0, 2)
+    run.look()
+    run.refer()
+    one = Candidate("volume")
+    assert run.reference is not None and run.add(one)
+    run.round(0.4, [one])
+    before, own = run.predicted(one).variance, run.pilots[one].seen
+    assert before == pytest.approx(own.variance * (own.mean / run.pilots[run.reference].seen.mean) ** 2)
+    run.pilots[one].sums *= 2.0
+    run.pilots[one].squares *= 4.0
+    assert run.pilots[one].seen.variance == pytest.approx(own.variance)
+    assert run.predicted(one).variance == pytest.approx(4.0 * before)

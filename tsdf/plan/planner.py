@@ -398,30 +398,29 @@ class _Planning:
         square, error = (apart.square, apart.square_error) if apart else (None, math.inf)
         size = one.floor
         if (missed := self.missed(plain)) is not None and size:
-            texture, texture_spread = missed
-            size = math.hypot(texture, math.hypot(one.bias, 0.5 * one.bias))
-            spread = max(texture_spread, ALIKE) if one.bias < texture else spread
-        return bias, bias_error, beliefs.of_square(size, spread, square, error), one.known or apart is not None
+            size = math.hypot(missed.value, math.hypot(one.bias, 0.5 * one.bias))
+            spread = max(math.log1p(missed.error / missed.value), ALIKE) if one.bias < missed.value else spread
+        floor = beliefs.of_square(size, spread, square, error)
+        if missed is not None and size:  # both are held against the same samples of the reference
+            floor = floor._replace(error=max(floor.error, missed.error))
+        return bias, bias_error, floor, one.known or apart is not None
 
-    def missed(self, plain: Candidate) -> tuple[float, float] | None:
-        """Return the texture that all levels without single grains miss alike, by the one that is believed to have the
-        least error, and the spread of its logarithm; None for that, and for levels that have some of it."""
+    def missed(self, plain: Candidate) -> Belief | None:
+        """Return the texture that all levels without single grains miss alike, by the pilot that knows it best; None for
+        that, and for levels that have some of it."""
         alike = [c for c in self.pilots if not c.explicit_grains and not LEVELS[c.level].traits.packed]
         seen = {c: apart for c in alike if (apart := self.apart(c)) is not None}
         if not seen or LEVELS[plain.level].traits.packed:
             return None
-        floors = {
-            c: beliefs.of_square(
-                self.expected[c.level].floor, max(self.expected[c.level].spread, 1e-9), a.square, a.square_error
-            )
-            for c, a in seen.items()
-        }
-        best = min(floors, key=lambda c: floors[c].value)
+        # by the error of texture squared, not by its value: the least of several values is too small
+        best = min(seen, key=lambda c: math.hypot(seen[c].square_error, 2.0 * seen[c].bias * seen[c].bias_error))
         if best == plain:
             return None
-        floor = floors[best]
-        off = min(abs(seen[best].bias), 0.9 * floor.value)
-        return max(math.sqrt(floor.value**2 - off**2), LEAST), math.log1p(floor.error / max(floor.value, LEAST))
+        apart, one = seen[best], self.expected[best.level]
+        floor = beliefs.of_square(one.floor, max(one.spread, 1e-9), apart.square, apart.square_error)
+        off = min(abs(apart.bias), 0.9 * floor.value)
+        texture = max(math.sqrt(floor.value**2 - off**2), LEAST)
+        return Belief(texture, math.hypot(floor.value * floor.error, off * apart.bias_error) / texture)
 
     def beside_the_reference(self, candidate: Candidate, floor: Belief) -> Belief:
         """Return a floor with what the reference itself may be off by, where that is not level explicit."""
@@ -463,9 +462,9 @@ class _Planning:
         """Return variance and time of a sample, by its pilot or from those of others, and whether it was the former."""
         own = self.pilots.get(candidate)
         assert self.reference is not None
-        best = self.pilots[self.reference].seen
+        best = self.of_reference(self.pilots[self.reference])
         if self.hidden(candidate):
-            seen = own.seen if own is not None and own.each else best
+            seen = self.of_reference(own) if own is not None and own.each else best
             return seen._replace(variance=math.inf), own is not None
         if own is not None and own.each:
             return self.with_suns(own), True
@@ -475,7 +474,7 @@ class _Planning:
         plain = self.pilots.get(Candidate(level))
         near = next((self.pilots[Candidate(o)] for o in ("teleport-memory", "teleport", "volume")
                      if Candidate(o) in self.pilots), None)  # fmt: skip
-        chain = (plain or near or self.pilots[self.reference]).seen
+        chain = self.of_reference(plain or near or self.pilots[self.reference])
         if not k:
             return chain, False
         share = 1.0 - math.exp(-k * self.coverage / chain.events) if chain.events else 0.0
@@ -484,9 +483,18 @@ class _Planning:
         }
         return chain._replace(**mixed), False
 
+    def of_reference(self, pilot: Pilot) -> Seen:
+        """Return what a pilot saw, its variance over the mean of the reference squared, where that is to be believed:
+        errors are over the mean of the true picture, not of one that is too bright."""
+        assert self.reference is not None
+        seen, best = pilot.seen, self.pilots[self.reference]
+        if not (seen.mean > 0.0 and self.trusted(best)):
+            return seen
+        return seen._replace(variance=seen.variance * (seen.mean / best.seen.mean) ** 2)
+
     def with_suns(self, pilot: Pilot) -> Seen:
         """Return what a pilot saw; its variance is not less than lights that it has hardly met will make it."""
-        seen = pilot.seen
+        seen = self.of_reference(pilot)
         if self.trusted(pilot):
             return seen
         return seen._replace(variance=max(seen.variance, 0.1 * self.coverage * self.chance))
