@@ -76,7 +76,7 @@ def test_a_dense_slab_seen_from_afar(far: Plan) -> None:
     assert far.chosen.floor.high < far.target and len(far.why) == 3
     assert far.chosen.seconds(far.target) <= of(far, "explicit").seconds(far.target)
     assert str(far.chosen.candidate) in far.why[0] and "R" in far.why[1] and far.why[2].startswith("runner-up")
-    assert far.spent < 6.0 and not far.fewer_far
+    assert far.spent > 0.0 and far.clock > 0.0 and not far.fewer_far
     told = report.facts(far)
     assert told["chosen"]["level"] == far.chosen.candidate.level and len(told["candidates"]) == len(far.predictions)
     assert all(len(line) < 300 and "\n" not in line for line in (*far.why, *far.notes, *far.needs))
@@ -122,7 +122,7 @@ def test_other_wishes_other_choices(far: Plan, ball: tsdf.Table) -> None:
     hurried = plan(pile(ball, 160.0), 0.002, seconds=0.5, threads=2)
     assert "least" in hurried.why[0]
     errors = [math.hypot(p.floor.high, p.noise(0.5 / hurried.load)) for p in hurried.predictions]
-    assert errors[0] <= 1.3 * min(errors)
+    assert errors[0] == min(errors)
 
 
 def test_only_the_camera_matters_to_scenes_without_grains() -> None:
@@ -157,9 +157,11 @@ def test_a_small_sun_is_left_to_levels_that_aim_at_it(ball: tsdf.Table, sky: flo
     assert found.rgb.mean() == pytest.approx(truth.rgb.mean(), rel=0.15)  # the level's bias and truth's noise of 3 %
 
 
-def test_where_there_is_nothing_to_see(ball: tsdf.Table) -> None:
+def test_where_there_is_nothing_to_see(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
     """Black scenes are planned, and nothing is said to be known of their noise; so are scenes without
     grains, or with none in sight. Those without light are refused."""
+    monkeypatch.setattr(planner, "SECONDS", 0.3)
+    monkeypatch.setattr(planner, "LEAST_PILOTS", 0.2)
     with pytest.raises(SceneError, match="a scene without light"):
         plan(replace(pile(ball, 160.0), lights=()), 0.05)
     away = replace(pile(ball, 160.0).camera, target=(0.0, -999.0, 999.0))
@@ -235,7 +237,7 @@ def test_without_a_stop_it_is_done_at_the_target(far: Plan, monkeypatch: pytest.
 
 
 def test_pilots_render_what_is_taken(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where grains look larger in some pixels than in most, explicit ones are fewer elsewhere: so they are in the pilots
+    """Where grains look larger in some pixels than in most, explicit ones are fewer elsewhere: so they are in pilots
     by which a plan is made. What is left of texture is that of the largest, from when k is enough for them; and that is
     not more than there is without explicit grains."""
     slanted = replace(pile(ball, 9.0), camera=Camera((0.0, -11.0, 2.0), (0.0, 12.0, 0.0), 24, 18, fov_deg=60.0))

@@ -285,7 +285,9 @@ def measure(
                     sums.add(block, radiance)
                     found += block.number * block.pixels
                     if progress is not None:
-                        progress(goal.part(done, found / count, spent(), reached, chance), f"{done + found // count} spp")
+                        progress(
+                            goal.part(done, found / count, spent(), reached, chance), f"{done + found // count} spp"
+                        )
                 if stop.is_set():
                     break
                 took, done = time.perf_counter() - start, done + share

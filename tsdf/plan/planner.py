@@ -25,6 +25,7 @@ from tsdf.plan.report import why
 from tsdf.scene.levels import LEVELS
 from tsdf.scene.medium import Component, free_path
 from tsdf.scene.scene import Scene
+from tsdf.spheres.packing import MAX as MOST_PACKED
 from tsdf.study.candidates import Candidate, candidates, taken
 from tsdf.walk.explicit import mesh_beside
 from tsdf.walk.geometry import Place
@@ -32,7 +33,7 @@ from tsdf.walk.geometry import Place
 TARGET = 0.02  # [1] where nothing else is asked for
 LEAST_TARGET, MOST_TARGET = 1e-4, 1.0
 GRAINS = (0, 3, 8, 16)  # explicit ones before a chain
-SECONDS, SHARE, MOST_SECONDS = 5.0, 0.1, 20.0  # [s] of planning; or this share of the render, up to so much
+SECONDS, SHARE, MOST_SECONDS = 5.0, 0.1, 20.0  # [s] of worlds and pilots; or this share of the render, up to so much
 LEAST_PILOTS = 2.0  # [s] for pilots, however long worlds take to build
 BUILDING = 0.4  # of the time, after which no more worlds are built
 TURN = 0.05  # of the time, that a sample of each pixel of the reference may take
@@ -133,7 +134,7 @@ class _Planning:
         self.notes: list[str] = []
         self.budget = max(SECONDS, min(SHARE * (seconds or 0.0), MOST_SECONDS))
         self.spp: int | None = None
-        self.spent, self.load = 0.0, 1.0
+        self.spent, self.load, self.began = 0.0, 1.0, time.perf_counter()
         self.places: dict[bool, Place] = {}
         self.pilots: dict[Candidate, Pilot] = {}
         self.reference: Candidate | None = None
@@ -169,12 +170,11 @@ class _Planning:
             chosen = self.choose(found)
         rest = sorted((p for p in found if p is not chosen), key=lambda p: (p.safe_seconds(self.target), p.floor.value))
         far = bool(chosen.candidate.explicit_grains) and self.far
-        lacking = needs.of_tables(
-            list(self.named), self.target, chosen.candidate.level, "explicit" not in self.impossible
-        )
+        thin = all(medium.packing_fraction <= MOST_PACKED for medium in self.scene.media)
+        lacking = needs.of_tables(self.named, self.target, chosen.candidate.level, thin)
         made = Plan(
             self.asked, self.target, self.seconds, (chosen, *rest), far, (), tuple(lacking), tuple(self.notes),
-            self.spent, self.threads, self.load,
+            self.spent, time.perf_counter() - self.began, self.threads, self.load,
         )  # fmt: skip
         return replace(made, why=why(made, self.bodies, self.footprint, self.coverage, str(self.reference)))
 
@@ -303,12 +303,12 @@ class _Planning:
             )
         assert self.reference is not None
         if not any(pilot.seen.mean > 0.0 for pilot in self.pilots.values()):
-            self.notes.append("no pilot has seen any light: nothing is known of noise, and all errors are expected ones")
+            self.notes.append("no pilot has seen any light: nothing is known of noise, and errors are expected ones")
         elif any(map(self.hidden, candidates(tuple(LEVELS), GRAINS))):
             self.notes.append(
-                "single grains meet suns and small bright lights by chance alone, too seldom for pilots: what explicit "
-                "grains take is not known and they are left out for levels that aim at lights, of which errors are what "
-                "is expected of slabs; a wider sun brings them back"
+                "single grains meet suns and small bright lights by chance alone, too seldom for pilots: what they take "
+                "is not known, and they are left out for levels that aim at lights, whose errors are what is expected of "
+                "slabs; a wider sun brings them back"
             )
 
     def finalists(self) -> list[Candidate]:
@@ -339,7 +339,7 @@ class _Planning:
         ]
 
     def trusted(self, pilot: Pilot) -> bool:
-        """Return whether a pilot has seen any light, and met what only chance finds of it often enough to be believed."""
+        """Return whether a pilot has seen light, and met what only chance finds of it often enough to be believed."""
         if not pilot.seen.mean > 0.0:
             return False
         return not (self.chance and pilot.world.media.singles) or self.often(pilot)
@@ -406,8 +406,8 @@ class _Planning:
         return bias, bias_error, floor, one.known or apart is not None
 
     def missed(self, plain: Candidate) -> Belief | None:
-        """Return the texture that all levels without single grains miss alike, by the pilot that knows it best; None for
-        that, and for levels that have some of it."""
+        """Return the texture that all levels without single grains miss alike, by the pilot that knows it best; None
+        for that, and for levels that have some of it."""
         alike = [c for c in self.pilots if not c.explicit_grains and not LEVELS[c.level].traits.packed]
         seen = {c: apart for c in alike if (apart := self.apart(c)) is not None}
         if not seen or LEVELS[plain.level].traits.packed:

@@ -150,6 +150,7 @@ def facts(plan: Plan) -> dict[str, Any]:
         "needs": list(plan.needs),
         "notes": list(plan.notes),
         "planning_seconds": round(plan.spent, 2),
+        "planning_clock_seconds": round(plan.clock, 2),
         "candidates": [
             {
                 "level": p.candidate.level,
