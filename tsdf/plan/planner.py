@@ -306,9 +306,9 @@ class _Planning:
             self.notes.append("no pilot has seen any light: nothing is known of noise, and errors are expected ones")
         elif any(map(self.hidden, candidates(tuple(LEVELS), GRAINS))):
             self.notes.append(
-                "single grains meet suns and small bright lights by chance alone, too seldom for pilots: what they take "
-                "is not known, and they are left out for levels that aim at lights, whose errors are what is expected of "
-                "slabs; a wider sun brings them back"
+                "single grains meet suns and small bright lights by chance alone, too seldom for pilots: what they "
+                "take is not known, and they are left out for levels that aim at lights, whose errors are what is "
+                "expected of slabs; a wider sun brings them back"
             )
 
     def finalists(self) -> list[Candidate]:
