@@ -40,9 +40,10 @@ def main(
 ) -> None:  # fmt: skip
     """Predict for SCENE, a TOML file, what each level costs and gets wrong, and say which to take.
 
-    It renders a few pixels at each level that may do, for 5 seconds in all, or a tenth of --seconds if that is more;
-    packings, records and machine code that are made for the first time come on top. tsdf-render without a level does
-    the same and renders what is chosen.
+    It renders a few pixels at each level that may do, for 5 seconds in all, or a tenth of --seconds if that is more, 20
+    at most, of processors that have nothing else to do; machine code that is made for the first time comes on top, and
+    so do packings and records where they leave less than 2 seconds. tsdf-render without a level does the same and
+    renders what is chosen.
     """
     from tsdf.errors import UsageError
     from tsdf.plan.planner import checked_target
@@ -74,4 +75,4 @@ def main(
     if not quiet:
         for note in plan.notes:
             click.echo(f"note: {plain(note)}", err=True)
-        click.echo(f"planned in {plan.spent:.1f} s", err=True)
+        click.echo(f"planned in {plan.spent:.1f} s of free processors, {plan.clock:.1f} s by the clock", err=True)

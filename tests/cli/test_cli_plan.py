@@ -1,6 +1,7 @@
 """``tsdf-plan`` as a user meets it."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from click.testing import CliRunner, Result
 from tsdf.cli.plan import main
 from tsdf.plan import planner
 from tsdf.reference_data.make_checks import CHECKS
+from tsdf.study.candidates import Candidate
 
 SCENE = (Path(__file__).parents[1] / "ball.toml").read_text()
 
@@ -35,14 +37,16 @@ def test_what_it_says(folder: Path) -> None:
     assert first.startswith("take ") and second.startswith("because ") and third.startswith("runner-up: ")
     assert need.startswith("table: ") and "--memory 64" in need
     facts = json.loads((folder / "plan.json").read_text())
-    assert [line.split("  ")[0] for line in rest[2:]][:1] == [facts["chosen"]["level"]] or facts["chosen"][
-        "explicit_grains"
-    ]
-    assert (
-        len(rest) - 2 == len(facts["candidates"]) and facts["target"] == 0.1 and facts["why"] == [first, second, third]
-    )
+    chosen = Candidate(facts["chosen"]["level"], facts["chosen"]["explicit_grains"])
+    assert rest[2].split("  ")[0] == str(chosen) and first.startswith(f"take {chosen}")
+    assert len(rest) - 2 == len(facts["candidates"]) and facts["target"] == 0.1
+    assert facts["why"] == [first, second, third]
     assert all(one["seconds_to_target"] is None or one["seconds_to_target"] > 0.0 for one in facts["candidates"])
-    assert "planned in" in result.stderr
+    told = re.search(r"planned in (\S+) s of free processors, (\S+) s by the clock\n", result.stderr)
+    assert told is not None and float(told[1]) == pytest.approx(facts["planning_seconds"], abs=0.06)
+    assert facts["planning_clock_seconds"] > 0.0 and float(told[2]) == pytest.approx(
+        facts["planning_clock_seconds"], abs=0.06
+    )
 
 
 def test_json(folder: Path) -> None:

@@ -1,6 +1,7 @@
 """Error bars: moments of samples against formulas, what is doubted and what is trusted."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +12,8 @@ from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.picture import render, world
 from tsdf.picture.render import BLOCK, FEW, Goal, Picture, Portion, Sums
-from tsdf.picture.trust import Moments, Trust, kurtosis_of
-from tsdf.scene.scene import Camera, GrainSpec, MediumSpec, Scene, Sphere, SunLight, SurfaceSpec
+from tsdf.picture.trust import MOST_VOV, Moments, Trust, kurtosis_of
+from tsdf.scene.scene import Camera, ConstantLight, GrainSpec, MediumSpec, Scene, Sphere, SunLight, SurfaceSpec
 from tsdf.walk.lights import compile_lights
 
 PIXELS = 60
@@ -113,13 +114,16 @@ def table() -> Table:
     return exact_sphere(load_grain("sphere"), Optics(1.5), Effort(cells=64, joint=8, memory=16))
 
 
-def picture(table: Table, level: str, diameter: float, spp: int = 16, threads: int = 2, seed: int = 0) -> Picture:
+def scene_of(table: Table, diameter: float) -> Scene:
     """Return a ball of beads on a floor under a sun."""
     medium = MediumSpec(Sphere((0.0, 0.0, 0.0), 8.0), 0.5, 1.0, (GrainSpec(table),), packing_spheres=200)
     floor = SurfaceSpec(Sphere((0.0, 0.0, -208.0), 200.0), (0.5, 0.4, 0.3))
     sun = SunLight((0.3, -0.5, 0.8), (3.0, 3.0, 3.0), diameter)
-    scene = Scene(Camera((0.0, -40.0, 10.0), (0.0, 0.0, 0.0), 24, 18, fov_deg=30.0), (sun,), (medium,), (floor,))
-    return render.render(world.build(scene, level), spp=spp, threads=threads, seed=seed)
+    return Scene(Camera((0.0, -40.0, 10.0), (0.0, 0.0, 0.0), 24, 18, fov_deg=30.0), (sun,), (medium,), (floor,))
+
+
+def picture(table: Table, level: str, diameter: float, spp: int = 16, threads: int = 2, seed: int = 0) -> Picture:
+    return render.render(world.build(scene_of(table, diameter), level), spp=spp, threads=threads, seed=seed)
 
 
 @pytest.mark.parametrize("level", ["explicit", "teleport-packed"])
@@ -131,6 +135,24 @@ def test_a_small_sun_that_only_chance_finds_is_doubted(table: Table, level: str)
     wide, aimed = picture(table, level, 60.0).trust, picture(table, "teleport", 0.53).trust
     assert wide is not None and wide.doubt is None
     assert aimed is not None and aimed.doubt is None
+
+
+def test_a_target_error_waits_for_suns_that_only_chance_finds(table: Table) -> None:
+    """Lossless grains before an even sky have no noise at all until one has met the sun, so an error that is asked for
+    is not reached, nor a picture black for good, before as many samples as show it; where light is aimed at, it is."""
+    for sky in (0.1, 0.0):
+        made = scene_of(table, 2.5)
+        made = replace(made, lights=(*made.lights, ConstantLight((sky,) * 3)) if sky else made.lights, surfaces=())
+        found = {
+            level: render.render(world.build(made, level), target_error=8.0, threads=2)
+            for level in ("explicit", "teleport")
+        }
+        waited, aimed = found["explicit"].trust, found["teleport"].trust
+        assert waited is not None and waited.chance <= MOST_VOV and found["explicit"].relative_error <= 8.0
+        assert aimed is not None and found["teleport"].samples.max() < found["explicit"].samples.max()
+    assert not Goal(None, None, 0.1).reached(10**6, math.inf, True, 1.01 * MOST_VOV)
+    assert Goal(None, None, 0.1).reached(10**6, math.inf, True, MOST_VOV)
+    assert Goal(None, None, 0.1).part(9, 9.0, 1.0, 1e-9, 10.0 * MOST_VOV) == pytest.approx(0.1)
 
 
 def test_trust_is_the_same_for_any_threads(table: Table) -> None:

@@ -1,6 +1,9 @@
 """What is expected and what is measured as one number; the atlas of level errors; what tables need."""
 
+import csv
 import math
+from importlib import resources
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,6 +35,22 @@ def test_belief() -> None:
     assert beliefs.of_bias(0.02) == (0.0, 0.02)
 
 
+@pytest.mark.parametrize("spread", [prior.SPREAD, 2.0 * prior.SPREAD])
+@pytest.mark.parametrize("relative", [0.01, 0.03, 0.06, 0.3])
+def test_beliefs_are_calibrated(spread: float, relative: float) -> None:
+    """The truth, drawn from what is expected, lies within two stated errors of what is believed about as often as two
+    standard deviations have it, 95.4 %, however sharp the measurement is, and is not stated much too wide either."""
+    rng = np.random.default_rng(5)
+    truth = 0.05 * np.exp(spread * rng.standard_normal(2000))
+    seen = truth**2 * (1.0 + relative * rng.standard_normal(len(truth)))
+    found = np.array([
+        beliefs.of_square(0.05, spread, q, relative * t**2) for t, q in zip(truth.tolist(), seen.tolist(), strict=True)
+    ])  # fmt: skip
+    inside = (abs(found[:, 0] - truth) <= 2.0 * found[:, 1]).mean()
+    assert 0.93 < inside < 0.98, inside
+    assert np.median(found[:, 1] / truth) == pytest.approx(0.5 * relative, rel=0.15)  # of a root
+
+
 def test_the_atlas_says_what_the_documents_say() -> None:
     """Slabs of 10 R of packed spheres, f = 0.6 (docs/memory.md): teleport is off by 3.1 % along the normal and 14.1 %
     at 60 degrees, teleport-memory by nothing that is seen; a dense slab has no small error at teleport, a dilute one
@@ -49,6 +68,26 @@ def test_the_atlas_says_what_the_documents_say() -> None:
     assert prior.slab_error("explicit", SPHERES) == (0.0, True)
     for level in LEVELS:
         assert 0.0 <= prior.slab_error(level, SPHERES._replace(albedo=0.95))[0] < 0.5
+
+
+def test_an_atlas_of_noise_is_an_atlas_of_no_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Deviations that are their standard errors times normal numbers come out as no error as often as not: the noise is
+    taken off their mean, not off each, where what is left could only be positive."""
+    path, rng = tmp_path / "noise.csv", np.random.default_rng(2)
+    with (resources.files("tsdf.reference_data") / prior.FILE).open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    for row in rows:
+        for name in ("reflectance", "transmittance"):
+            row[f"{name}_deviation"], row[f"{name}_deviation_error"] = 0.1 * rng.standard_normal(), 0.1
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    monkeypatch.setattr(prior, "FILE", str(path))
+    for level, error in prior.atlas.__wrapped__().error.items():
+        found = error[np.isfinite(error)]
+        assert (found == prior.LEAST).mean() > 0.45, level
+        assert found.max() > prior.LEAST
 
 
 def test_the_atlas_is_between_its_neighbours() -> None:
@@ -94,10 +133,13 @@ def test_what_tables_need() -> None:
     """Records that are missing, and paths where few are known; nothing of a table that has all. The command is the one
     that made it, with other options."""
     bare, full = tsdf.read(CHECKS / "PHYSICS_CHORD.tsdf.exr"), tsdf.read(CHECKS / "cube_memory.tsdf.exr")
-    (line,) = needs.of_tables([("bare.exr", bare), ("bare.exr", bare)], 0.5, "explicit", True)
+    (line,) = needs.of_tables([("bare.exr", bare), ("bare.exr", bare)], 0.5, "explicit")
     assert line.startswith("bare.exr has no records by entry") and line.endswith("by tsdf-build with --memory 64")
-    assert needs.of_tables([("full.exr", full)], 0.5, "explicit", True) == []
-    (line,) = needs.of_tables([("full.exr", full)], 1e-4, "teleport-memory", True)
+    assert (
+        needs.of_tables([("bare.exr", bare)], 0.5, "explicit", False) == []
+    )  # too dense for levels that draw from them
+    assert needs.of_tables([("full.exr", full)], 0.5, "explicit") == []
+    (line,) = needs.of_tables([("full.exr", full)], 1e-4, "teleport-memory")
     off = full.header["standard_errors"]["mean_cosine"] / (1.0 - full.mean_cosine())
     assert f"knows 1 - g to {off:.1%} only" in line and "by tsdf-build with --paths" in line
     made = needs._command("tsdf-build snow --paths 400000 --cells 256", "s.exr", {"--paths": "1e+08", "--joint": "32"})

@@ -1,5 +1,6 @@
 """Plans as a whole, with short pilots: what they must not say, what they refuse, and how they reach pictures."""
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -8,14 +9,15 @@ import numpy as np
 import pytest
 
 import tsdf
-from tsdf.errors import UsageError
+from tsdf.errors import SceneError, UsageError
 from tsdf.picture import render, world
 from tsdf.plan import planner, report, shot
 from tsdf.plan.beliefs import CERTAIN, Belief
-from tsdf.plan.pilot import Pilot
+from tsdf.plan.pilot import Apart, Pilot
 from tsdf.plan.planner import plan
 from tsdf.plan.prediction import Plan, Prediction
 from tsdf.reference_data.make_checks import CHECKS
+from tsdf.scene.levels import LEVELS
 from tsdf.scene.scene import (
     Box,
     Camera,
@@ -74,7 +76,7 @@ def test_a_dense_slab_seen_from_afar(far: Plan) -> None:
     assert far.chosen.floor.high < far.target and len(far.why) == 3
     assert far.chosen.seconds(far.target) <= of(far, "explicit").seconds(far.target)
     assert str(far.chosen.candidate) in far.why[0] and "R" in far.why[1] and far.why[2].startswith("runner-up")
-    assert far.spent < 6.0 and not far.fewer_far
+    assert far.spent > 0.0 and far.clock > 0.0 and not far.fewer_far
     told = report.facts(far)
     assert told["chosen"]["level"] == far.chosen.candidate.level and len(told["candidates"]) == len(far.predictions)
     assert all(len(line) < 300 and "\n" not in line for line in (*far.why, *far.notes, *far.needs))
@@ -120,7 +122,7 @@ def test_other_wishes_other_choices(far: Plan, ball: tsdf.Table) -> None:
     hurried = plan(pile(ball, 160.0), 0.002, seconds=0.5, threads=2)
     assert "least" in hurried.why[0]
     errors = [math.hypot(p.floor.high, p.noise(0.5 / hurried.load)) for p in hurried.predictions]
-    assert errors[0] <= 1.3 * min(errors)
+    assert errors[0] == min(errors)
 
 
 def test_only_the_camera_matters_to_scenes_without_grains() -> None:
@@ -128,6 +130,48 @@ def test_only_the_camera_matters_to_scenes_without_grains() -> None:
     scene = Scene(Camera((0.0, -9.0, 9.0), (0.0, 0.0, 0.0), 8, 6), LIGHTS, (), (floor,))
     made = plan(scene, 0.05, threads=1)
     assert made.chosen.floor == CERTAIN and "no grains" in made.why[1]
+
+
+SUN = SunLight((0.6, 0.0, 0.8), (3.0, 3.0, 3.0), 0.53)
+
+
+@pytest.mark.parametrize("sky", [0.1, 0.0])
+def test_a_small_sun_is_left_to_levels_that_aim_at_it(ball: tsdf.Table, sky: float) -> None:
+    """Single grains meet it once in 200,000 times; until then explicit is dark, or black, with no noise at all, and
+    would be taken. So it is not, and the picture is as bright as an explicit one under a sun as strong but wide."""
+    lights = (SUN, ConstantLight((sky,) * 3)) if sky else (SUN,)
+    scene = replace(pile(ball, 9.0), lights=lights)
+    made = plan(scene, 0.05, threads=2)
+    one = made.chosen.candidate
+    assert not one.explicit_grains and not LEVELS[one.level].traits.packed
+    assert any("levels that aim at lights" in note for note in made.notes)
+    assert math.isfinite(made.chosen.variance) and math.isinf(of(made, "explicit").variance)
+    assert f"{made.chosen.candidate}" in made.why[0] and json.dumps(report.facts(made), allow_nan=False)
+    assert report.table(made)[1].startswith(str(one)) and any("not known" in line for line in report.table(made))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("warnings.warn", lambda *_, **__: None)
+        patch.setattr(shot, "plan", lambda *_: made)
+        found = tsdf.render(scene, target_error=0.1, threads=2)
+        wide = replace(scene, lights=(replace(SUN, angular_diameter_deg=15.0), *lights[1:]))
+        truth = tsdf.render(wide, "explicit", spp=1500, threads=2)
+    assert found.rgb.mean() == pytest.approx(truth.rgb.mean(), rel=0.15)  # the level's bias and truth's noise of 3 %
+
+
+def test_where_there_is_nothing_to_see(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Black scenes are planned, and nothing is said to be known of their noise; so are scenes without
+    grains, or with none in sight. Those without light are refused."""
+    monkeypatch.setattr(planner, "SECONDS", 0.3)
+    monkeypatch.setattr(planner, "LEAST_PILOTS", 0.2)
+    with pytest.raises(SceneError, match="a scene without light"):
+        plan(replace(pile(ball, 160.0), lights=()), 0.05)
+    away = replace(pile(ball, 160.0).camera, target=(0.0, -999.0, 999.0))
+    made = plan(replace(pile(ball, 160.0), camera=away), 0.05, threads=2)
+    assert len(made.why) == 3 and math.isfinite(made.chosen.variance)
+    black = plan(replace(pile(ball, 160.0), camera=away, lights=(SUN,)), 0.05, threads=2)
+    assert any("no pilot has seen any light" in note for note in black.notes)
+    assert "nothing is known of its noise" in black.why[0] and json.dumps(report.facts(black), allow_nan=False)
+    for lights in (LIGHTS, (SUN,)):
+        assert plan(Scene(away, lights, ()), 0.05, threads=1).why[0].startswith("take ")
 
 
 def test_tables_without_records(tmp_path: Path) -> None:
@@ -190,3 +234,61 @@ def test_without_a_stop_it_is_done_at_the_target(far: Plan, monkeypatch: pytest.
     choice = shot.chosen(far.scene)
     assert (choice.spp, choice.seconds) == (None, None) and choice.target_error is not None
     assert math.hypot(choice.target_error, far.chosen.floor.value) == pytest.approx(far.target)
+
+
+def test_pilots_render_what_is_taken(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where grains look larger in some pixels than in most, explicit ones are fewer elsewhere: so they are in pilots
+    by which a plan is made. What is left of texture is that of the largest, from when k is enough for them; and that is
+    not more than there is without explicit grains."""
+    slanted = replace(pile(ball, 9.0), camera=Camera((0.0, -11.0, 2.0), (0.0, 12.0, 0.0), 24, 18, fov_deg=60.0))
+    monkeypatch.setattr(planner, "FEWER", 1.1)
+    seen: dict[bool, list[int]] = {True: [], False: []}
+    for far in (True, False):
+        run = planner._Planning(slanted if far else pile(ball, 160.0), 0.05, None, 0, 2)
+        run.look()
+        run.refer()
+        assert run.far == far
+        for k in (0, 8):
+            assert run.add(Candidate("teleport-memory", k))
+            seen[far].append(int(run.pilots[Candidate("teleport-memory", k)].world.met.sum()))
+        whole = Belief(0.4, 0.05)
+        assert run.faded(whole, 0.0, 0.0, 0, 1).value <= 0.4 * (1.0 if far else 0.8)
+        left = run.faded(whole, 0.0, 0.0, 0, 8).value / run.faded(whole, 0.0, 0.0, 8, 16).value
+        assert left == pytest.approx(run.ratio if far else 1.0)
+    assert seen[True][0] == 0 < seen[True][1] and seen[False] == [0, 0]
+
+
+def test_what_levels_miss_alike_is_by_the_best_measured(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of three pilots of one texture the sharpest speaks for the others, not the one that came out least; what is
+    believed of these is no sharper than that, for it is against the same samples."""
+    run = planner._Planning(pile(ball, 160.0), 0.05, None, 0, 2)
+    run.look()
+    run.refer()
+    squares = {"volume": (0.010, 0.004), "teleport": (0.011, 0.0005), "teleport-memory": (0.002, 0.004)}
+    for level in squares:
+        assert run.add(Candidate(level))
+    apart = {Candidate(level): Apart(0.0, 0.001, *square) for level, square in squares.items()}
+    monkeypatch.setattr(planner._Planning, "apart", lambda _, candidate: apart.get(candidate))
+    best = run.without(Candidate("teleport"), run.expected["teleport"])[2]
+    for level in ("volume", "teleport-memory"):
+        missed = run.missed(Candidate(level))
+        assert missed is not None and missed.value == pytest.approx(math.sqrt(0.011), rel=0.02)
+        floor = run.without(Candidate(level), run.expected[level]._replace(bias=0.0))[2]
+        assert floor.value == pytest.approx(math.sqrt(0.011), rel=planner.ALIKE) and floor.error >= 0.99 * best.error
+    assert run.missed(Candidate("teleport")) is None
+
+
+def test_noise_is_over_the_true_mean(ball: tsdf.Table) -> None:
+    """A candidate twice as bright as the reference has four times the variance over the mean of that."""
+    run = planner._Planning(pile(ball, 160.0), 0.05, None, 0, 2)
+    run.look()
+    run.refer()
+    one = Candidate("volume")
+    assert run.reference is not None and run.add(one)
+    run.round(0.4, [one])
+    before, own = run.predicted(one).variance, run.pilots[one].seen
+    assert before == pytest.approx(own.variance * (own.mean / run.pilots[run.reference].seen.mean) ** 2)
+    run.pilots[one].sums *= 2.0
+    run.pilots[one].squares *= 4.0
+    assert run.pilots[one].seen.variance == pytest.approx(own.variance)
+    assert run.predicted(one).variance == pytest.approx(4.0 * before)

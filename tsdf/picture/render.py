@@ -20,7 +20,7 @@ import numpy as np
 
 from tsdf.errors import SceneError, UsageError
 from tsdf.handle import Handle
-from tsdf.picture.trust import Moments, Trust, kurtosis_of
+from tsdf.picture.trust import MOST_VOV, Moments, Trust, kurtosis_of
 from tsdf.picture.world import World, camera_of, sees
 from tsdf.scene.levels import LEVELS
 from tsdf.walk import packed, transport
@@ -212,7 +212,8 @@ def render(
     seconds : float, optional
         Stop when another pass over all pixels would take longer than this; one is always made.
     target_error : float, optional
-        Stop when `Picture.relative_error` is below this.
+        Stop when `Picture.relative_error` is below this, and as many samples are taken as lights that are met by chance
+        alone need to show in it (`Trust.chance` not above `trust.MOST_VOV`).
     seed : int
         The same seed and number of samples give the same picture for any number of threads.
     threads : int, optional
@@ -275,7 +276,7 @@ def measure(
         made = sums.picture(np.sum([walkers.counters for walkers in pool], axis=0), spent(), interrupted)
         return replace(made, processor_seconds=time.process_time() - worked)
 
-    done, share, took, reached = 0, 0, 0.0, math.inf
+    done, share, took, reached, chance = 0, 0, 0.0, math.inf, 0.0
     with ThreadPoolExecutor(threads) as executor:
         try:
             while not stop.is_set() and (share := goal.following(done, share, took, spent(), count)) > 0:
@@ -284,13 +285,15 @@ def measure(
                     sums.add(block, radiance)
                     found += block.number * block.pixels
                     if progress is not None:
-                        progress(goal.part(done, found / count, spent(), reached), f"{done + found // count} spp")
+                        progress(
+                            goal.part(done, found / count, spent(), reached, chance), f"{done + found // count} spp"
+                        )
                 if stop.is_set():
                     break
                 took, done = time.perf_counter() - start, done + share
                 if target_error is not None and done > 1:
-                    reached = max(picture(False).relative_error, 1e-9)
-                if goal.reached(done, reached, sums.black):
+                    reached, chance = max(picture(False).relative_error, 1e-9), sums.chance
+                if goal.reached(done, reached, sums.black, chance):
                     break
         except KeyboardInterrupt:
             stop.set()
@@ -367,6 +370,11 @@ class Sums:
     def black(self) -> bool:
         """Whether no sample has found light yet."""
         return not self.total.any()
+
+    @property
+    def chance(self) -> float:
+        """`Trust.chance` so far."""
+        return self.kurtosis / max(int(self.samples.sum()), 1)
 
     def add(self, block: Portion, radiance: np.ndarray) -> None:
         """Add the radiance (pixels, number, 3) of a block."""
@@ -457,16 +465,21 @@ class Goal:
         each = max(took, 1e-6) / share  # of a pass of one sample
         return min(max(int(min(left, self.seconds / PARTS) / each), int(left >= each)), most, GROWTH * share)
 
-    def part(self, done: int, found: float, spent: float, error: float) -> float:
-        """Return the share done in [0, 1], with `found` samples per pixel of a pass after `done`, at this error."""
+    def part(self, done: int, found: float, spent: float, error: float, chance: float = 0.0) -> float:
+        """Return the share done in [0, 1], with `found` samples per pixel of a pass after `done`, at this error and
+        `Trust.chance`."""
         if self.target_error is not None and done > 1:
-            return min(1.0, (self.target_error / error) ** 2)
+            return min(1.0, (self.target_error / error) ** 2, MOST_VOV / max(chance, MOST_VOV))
         if self.seconds is not None:
             return min(1.0, spent / self.seconds)
         return (done + found) / self.spp if self.spp else 0.0
 
-    def reached(self, done: int, error: float, black: bool) -> bool:
-        """Return whether an error is small enough after `done` samples per pixel, or never will be."""
-        if self.target_error is None:
+    def reached(self, done: int, error: float, black: bool, chance: float = 0.0) -> bool:
+        """Return whether an error is small enough after `done` samples per pixel, or never will be.
+
+        Neither is known before lights that are met by chance alone have been met about 1 / `MOST_VOV` times: until then
+        a picture looks free of noise for their light is missing from it.
+        """
+        if self.target_error is None or chance > MOST_VOV:
             return False
         return (done > 1 and error <= self.target_error) or (done >= BLACK and black)

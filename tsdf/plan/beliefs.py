@@ -11,10 +11,13 @@ import numpy as np
 
 STEPS = 241  # of the grid
 REACH = 6.0  # spreads on either side
+FINE = 4.0  # steps of the grid that what is believed must spread over
+QUANTILES = (0.5, 0.8413)  # the second one standard deviation above the first, of what is normal
+PASSES = 12  # over ever finer grids, at most
 
 
 class Belief(NamedTuple):
-    """An error that is not below zero [1]: by the mean of its logarithm, and by how much more it may well be."""
+    """An error that is not below zero [1]: its median, and by how much more it may well be (one standard deviation)."""
 
     value: float
     error: float
@@ -42,17 +45,23 @@ def of_square(expected: float, spread: float, square: float | None = None, error
     """
     if not expected > 0.0:
         return CERTAIN
-    log = np.linspace(-REACH * spread, REACH * spread, STEPS)
-    size = expected * np.exp(log)
-    weight = -0.5 * (log / spread) ** 2
-    if square is not None and error < math.inf:
-        weight = weight - 0.5 * ((size**2 - square) / max(error, 1e-12)) ** 2
-    weight = np.exp(weight - weight.max())
-    weight /= weight.sum()
-    mean = float(weight @ log)
-    left = math.sqrt(max(float(weight @ log**2) - mean**2, 0.0))
-    value = expected * math.exp(mean)
-    return Belief(value, value * math.expm1(left))
+    low, high = -REACH * spread, REACH * spread
+    for _ in range(PASSES):  # about the mode, until it is resolved
+        log = np.linspace(low, high, STEPS)
+        weight = -0.5 * (log / spread) ** 2
+        if square is not None and error < math.inf:
+            size = expected * np.exp(log)
+            weight = weight - 0.5 * ((size**2 - square) / max(error, 1e-12)) ** 2
+        mode = float(log[np.argmax(weight)])
+        weight = np.exp(weight - weight.max())
+        weight /= weight.sum()
+        mean, step = float(weight @ log), (high - low) / (STEPS - 1)
+        left = math.sqrt(float(weight @ (log - mean) ** 2))
+        if left > FINE * step:
+            break
+        low, high = mode - REACH * max(left, step), mode + REACH * max(left, step)
+    value, most = expected * np.exp(np.interp(QUANTILES, np.cumsum(weight) - 0.5 * weight, log))
+    return Belief(float(value), float(most - value))
 
 
 def of_bias(expected: float, measured: float | None = None, error: float = math.inf) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from tsdf.scene.levels import LEVELS
 ENOUGH = 0.25  # of the error that is asked for that a table may be off by
 
 
-def of_tables(tables: Sequence[tuple[str, Table]], target: float, level: str, packed: bool) -> list[str]:
+def of_tables(tables: Sequence[tuple[str, Table]], target: float, level: str, chained: bool = True) -> list[str]:
     """Return what tables need for a picture of an error, one line each.
 
     Parameters
@@ -20,15 +20,15 @@ def of_tables(tables: Sequence[tuple[str, Table]], target: float, level: str, pa
         Error of the picture [1].
     level : str
         That is taken.
-    packed : bool
-        Whether grains can be packed at random and traced.
+    chained : bool
+        Whether packings are thin enough for the levels that draw from records by entry.
     """
     lines = []
     for name, table in dict(tables).items():
         made = table.header["provenance"]["command"]
         wants: dict[str, str] = {}
         reasons = []
-        if not table.memory:
+        if chained and not table.memory:
             reasons.append("has no records by entry, which teleport-memory and teleport-packed draw from")
             wants["--memory"] = "64"
         if level == "teleport" and not table.joint:

@@ -24,7 +24,7 @@ AT_ONCE = 1 << 15  # samples of a thread at once, at most
 
 
 class Seen(NamedTuple):
-    """What a pilot saw; numbers are over its mean, with standard errors."""
+    """What a pilot saw; numbers are over its mean, with standard errors, and infinite where that is black."""
 
     mean: float  # radiance
     mean_error: float  # over it [1]
@@ -118,14 +118,14 @@ class Pilot:
         """What it saw so far."""
         n, count = len(self.pixels), HALVES * self.each
         total, squares = self.sums.sum(axis=0), self.squares.sum(axis=0)
-        mean = max(float(total.mean()) / count, 1e-300)
+        mean = float(total.mean()) / max(count, 1)
+        events, each = sum(int(one.counters[0]) for one in self._walkers), self.timed / max(self.timed_samples, 1)
+        met = events / max(count * n, 1)
+        if not mean > 0.0:
+            return Seen(0.0, math.inf, math.inf, each, met, count * n)
         variance = np.maximum(squares / count - (total / count) ** 2, 0.0) * count / max(count - 1, 1)
         grey = float(variance.mean())
-        events = sum(int(one.counters[0]) for one in self._walkers)
-        error = math.sqrt(grey / (count * n)) / mean
-        return Seen(
-            mean, error, grey / mean**2, self.timed / max(self.timed_samples, 1), events / (count * n), count * n
-        )
+        return Seen(mean, math.sqrt(grey / (count * n)) / mean, grey / mean / mean, each, met, count * n)
 
     def pixel_means(self, half: int) -> np.ndarray:
         """Mean radiance of each pixel (n, 3) in one half."""
@@ -133,7 +133,7 @@ class Pilot:
         return means
 
     def apart(self, other: "Pilot") -> Apart:
-        """Return how it differs from another of the same picture."""
+        """Return how it differs from another of the same picture, which is not black."""
         mean = other.seen.mean
         one, two = ((self.pixel_means(h) - other.pixel_means(h)) / mean for h in range(HALVES))
         both, product = 0.5 * (one + two).mean(axis=1), (one * two).mean(axis=1)

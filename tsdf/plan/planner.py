@@ -25,6 +25,7 @@ from tsdf.plan.report import why
 from tsdf.scene.levels import LEVELS
 from tsdf.scene.medium import Component, free_path
 from tsdf.scene.scene import Scene
+from tsdf.spheres.packing import MAX as MOST_PACKED
 from tsdf.study.candidates import Candidate, candidates, taken
 from tsdf.walk.explicit import mesh_beside
 from tsdf.walk.geometry import Place
@@ -32,7 +33,7 @@ from tsdf.walk.geometry import Place
 TARGET = 0.02  # [1] where nothing else is asked for
 LEAST_TARGET, MOST_TARGET = 1e-4, 1.0
 GRAINS = (0, 3, 8, 16)  # explicit ones before a chain
-SECONDS, SHARE, MOST_SECONDS = 5.0, 0.1, 20.0  # [s] of planning; or this share of the render, up to so much
+SECONDS, SHARE, MOST_SECONDS = 5.0, 0.1, 20.0  # [s] of worlds and pilots; or this share of the render, up to so much
 LEAST_PILOTS = 2.0  # [s] for pilots, however long worlds take to build
 BUILDING = 0.4  # of the time, after which no more worlds are built
 TURN = 0.05  # of the time, that a sample of each pixel of the reference may take
@@ -44,7 +45,8 @@ LATEST = 0.7  # of the time, after which nothing more is made ready for the seco
 CHECK = 0.1  # of the time for a look at what is chosen and was not seen
 NEAR = 3.0  # times as long as the best as a candidate may seem to take to be looked at again
 EVENT_S = (1.0e-6, 5.0e-6)  # [s] of one explicit grain, an exact sphere and one of facets, about
-MEETINGS = 30.0  # of lights that are met by chance alone, that a pilot is believed from on
+MEETINGS = 400.0  # of lights that are met by chance alone, that a pilot is believed from on: its mean, and what others
+# differ from it by, is known to a twentieth then, and the error bar of that to as much
 LEAST_PER_E = 2.0  # explicit grains of facets that bring texture down by e, at least
 TIE = 1.1  # times as long as the cheapest as it may take, of those the one with the least error is taken
 ALIKE = 0.2  # of the logarithm of an error, what two levels of teleportation may differ by
@@ -118,10 +120,21 @@ class _Planning:
         self.asked, self.target, self.seconds, self.seed, self.threads = scene, target, seconds, seed, threads
         self.told: Callable[[float, str], None] = lambda share, word: None
         self.scene, self.tables = loaded(scene)
+        camera = self.scene.camera
+        self.pixels, self.looked_at = camera.width * camera.height, PIXELS
+        self.named = [
+            (str(spec.table), table)
+            for spec, table in zip((g for m in scene.media for g in m.grains), self.tables, strict=True)
+            if not isinstance(spec.table, Table)
+        ]
+        self.bodies: list[prior.Body] = []
+        self.expected: dict[str, prior.Expected] = {}
+        self.footprint, self.coverage, self.ratio, self.far = math.inf, 0.0, 1.0, False  # see `prior.looks`
+        self.chance = 0.0  # kurtosis of lights that single grains meet by chance
         self.notes: list[str] = []
         self.budget = max(SECONDS, min(SHARE * (seconds or 0.0), MOST_SECONDS))
         self.spp: int | None = None
-        self.spent, self.load = 0.0, 1.0
+        self.spent, self.load, self.began = 0.0, 1.0, time.perf_counter()
         self.places: dict[bool, Place] = {}
         self.pilots: dict[Candidate, Pilot] = {}
         self.reference: Candidate | None = None
@@ -156,13 +169,12 @@ class _Planning:
             found = self.predictions()
             chosen = self.choose(found)
         rest = sorted((p for p in found if p is not chosen), key=lambda p: (p.safe_seconds(self.target), p.floor.value))
-        far = bool(chosen.candidate.explicit_grains) and self.ratio > FEWER
-        lacking = needs.of_tables(
-            list(self.named), self.target, chosen.candidate.level, "explicit" not in self.impossible
-        )
+        far = bool(chosen.candidate.explicit_grains) and self.far
+        thin = all(medium.packing_fraction <= MOST_PACKED for medium in self.scene.media)
+        lacking = needs.of_tables(self.named, self.target, chosen.candidate.level, thin)
         made = Plan(
             self.asked, self.target, self.seconds, (chosen, *rest), far, (), tuple(lacking), tuple(self.notes),
-            self.spent, self.threads, self.load,
+            self.spent, time.perf_counter() - self.began, self.threads, self.load,
         )  # fmt: skip
         return replace(made, why=why(made, self.bodies, self.footprint, self.coverage, str(self.reference)))
 
@@ -174,15 +186,9 @@ class _Planning:
         world = build(self.scene, "volume", leap=0.0, places=self.places)
         self.bodies = prior.bodies(world, self.tables)
         self.footprint, self.coverage, self.ratio = prior.looks(world)
-        self.chance = kurtosis_of(world.lights) if world.lights.sampled else 0.0
-        camera = self.scene.camera
-        self.pixels = camera.width * camera.height
+        self.far = self.ratio > FEWER
+        self.chance = kurtosis_of(world.lights) if world.lights.sampled and self.bodies else 0.0
         self.expected = {level: self.foreseen(level) for level in LEVELS}
-        self.named = [
-            (str(spec.table), table)
-            for spec, table in zip((g for m in self.asked.media for g in m.grains), self.tables, strict=True)
-            if not isinstance(spec.table, Table)
-        ]
         if not all(one.known for one in self.expected.values()):
             self.notes.append(
                 "the scene lies outside the atlas of level errors: what no pilot has seen is known within a factor of "
@@ -215,6 +221,7 @@ class _Planning:
             return None
         try:
             scene = taken(self.scene, candidate)
+            scene = replace(scene, render=replace(scene.render, fewer_far=self.far and candidate.explicit_grains > 0))
             return build(scene, candidate.level, progress=self.told, places=self.places)
         except (SceneError, UsageError) as error:
             if not candidate.explicit_grains:
@@ -294,11 +301,14 @@ class _Planning:
             self.notes.append(
                 f"processors are busy with other things: now everything takes {self.load:.1f} times as long"
             )
-
-        if self.reference is not None and not self.trusted(self.pilots[self.reference]):
+        assert self.reference is not None
+        if not any(pilot.seen.mean > 0.0 for pilot in self.pilots.values()):
+            self.notes.append("no pilot has seen any light: nothing is known of noise, and errors are expected ones")
+        elif any(map(self.hidden, candidates(tuple(LEVELS), GRAINS))):
             self.notes.append(
-                "single grains meet suns and small bright lights by chance alone, too seldom for pilots: errors are "
-                "what is expected of slabs, and levels that aim at lights are the safer choice"
+                "single grains meet suns and small bright lights by chance alone, too seldom for pilots: what they "
+                "take is not known, and they are left out for levels that aim at lights, whose errors are what is "
+                "expected of slabs; a wider sun brings them back"
             )
 
     def finalists(self) -> list[Candidate]:
@@ -329,8 +339,23 @@ class _Planning:
         ]
 
     def trusted(self, pilot: Pilot) -> bool:
-        """Return whether a pilot has met the lights that only chance finds often enough to be believed."""
-        return not (self.chance and pilot.world.media.singles) or pilot.seen.samples / self.chance > MEETINGS
+        """Return whether a pilot has seen light, and met what only chance finds of it often enough to be believed."""
+        if not pilot.seen.mean > 0.0:
+            return False
+        return not (self.chance and pilot.world.media.singles) or self.often(pilot)
+
+    def often(self, pilot: Pilot) -> bool:
+        """Return whether so many samples as a pilot has are enough for lights that are met by chance alone."""
+        return not self.chance or pilot.seen.samples * self.coverage / self.chance > MEETINGS
+
+    def hidden(self, candidate: Candidate) -> bool:
+        """Return whether a candidate's single grains meet lights too seldom for its variance to be known: by the pilot
+        of the reference, if that has single grains, or else by its own or one of as many samples as the reference's."""
+        assert self.reference is not None
+        if not _singly(candidate):
+            return False
+        best = self.pilots[self.reference]
+        return not self.often(best if _singly(self.reference) else self.pilots.get(candidate, best))
 
     def apart(self, candidate: Candidate) -> Apart | None:
         """Return how a candidate differs from the reference as far as that is known."""
@@ -351,18 +376,17 @@ class _Planning:
         base = 0
         for fewer in GRAINS[1:]:  # what is seen of fewer explicit grains says more of this number than none does
             if fewer <= k and (later := self.apart(Candidate(level, fewer))) is not None:
-                floor = self.faded(floor, bias, bias_error, fewer - base)
+                floor = self.faded(floor, bias, bias_error, base, fewer)
                 floor = beliefs.of_square(max(floor.value, LEAST), UNSURE, later.square, later.square_error)
                 bias, bias_error = beliefs.of_bias(max(abs(bias), bias_error), later.bias, later.bias_error)
                 base, known = fewer, True
-        floor = self.faded(floor, bias, bias_error, k - base)
+        floor = self.faded(floor, bias, bias_error, base, k)
         floor = self.beside_the_reference(candidate, floor)
-        texture = math.sqrt(max(floor.value**2 - bias**2, 0.0))
+        texture, most = (math.sqrt(max(value**2 - bias**2, 0.0)) for value in (floor.value, floor.high))
         seen, piloted = self.cost(candidate)
         turn = seen.seconds * self.pixels / self.threads
         return Prediction(
-            candidate, bias, bias_error, texture, min(floor.error, max(texture, floor.error)), floor,
-            seen.variance, turn, piloted, known,
+            candidate, bias, bias_error, texture, most - texture, floor, seen.variance, turn, piloted, known,
         )  # fmt: skip
 
     def without(self, plain: Candidate, one: prior.Expected) -> tuple[float, float, Belief, bool]:
@@ -374,30 +398,29 @@ class _Planning:
         square, error = (apart.square, apart.square_error) if apart else (None, math.inf)
         size = one.floor
         if (missed := self.missed(plain)) is not None and size:
-            texture, texture_spread = missed
-            size = math.hypot(texture, math.hypot(one.bias, 0.5 * one.bias))
-            spread = max(texture_spread, ALIKE) if one.bias < texture else spread
-        return bias, bias_error, beliefs.of_square(size, spread, square, error), one.known or apart is not None
+            size = math.hypot(missed.value, math.hypot(one.bias, 0.5 * one.bias))
+            spread = max(math.log1p(missed.error / missed.value), ALIKE) if one.bias < missed.value else spread
+        floor = beliefs.of_square(size, spread, square, error)
+        if missed is not None and size:  # both are held against the same samples of the reference
+            floor = floor._replace(error=max(floor.error, missed.error))
+        return bias, bias_error, floor, one.known or apart is not None
 
-    def missed(self, plain: Candidate) -> tuple[float, float] | None:
-        """Return the texture that all levels without single grains miss alike, by the one that is believed to have the
-        least error, and the spread of its logarithm; None for that, and for levels that have some of it."""
+    def missed(self, plain: Candidate) -> Belief | None:
+        """Return the texture that all levels without single grains miss alike, by the pilot that knows it best; None
+        for that, and for levels that have some of it."""
         alike = [c for c in self.pilots if not c.explicit_grains and not LEVELS[c.level].traits.packed]
         seen = {c: apart for c in alike if (apart := self.apart(c)) is not None}
         if not seen or LEVELS[plain.level].traits.packed:
             return None
-        floors = {
-            c: beliefs.of_square(
-                self.expected[c.level].floor, max(self.expected[c.level].spread, 1e-9), a.square, a.square_error
-            )
-            for c, a in seen.items()
-        }
-        best = min(floors, key=lambda c: floors[c].value)
+        # by the error of texture squared, not by its value: the least of several values is too small
+        best = min(seen, key=lambda c: math.hypot(seen[c].square_error, 2.0 * seen[c].bias * seen[c].bias_error))
         if best == plain:
             return None
-        floor = floors[best]
-        off = min(abs(seen[best].bias), 0.9 * floor.value)
-        return max(math.sqrt(floor.value**2 - off**2), LEAST), math.log1p(floor.error / max(floor.value, LEAST))
+        apart, one = seen[best], self.expected[best.level]
+        floor = beliefs.of_square(one.floor, max(one.spread, 1e-9), apart.square, apart.square_error)
+        off = min(abs(apart.bias), 0.9 * floor.value)
+        texture = max(math.sqrt(floor.value**2 - off**2), LEAST)
+        return Belief(texture, math.hypot(floor.value * floor.error, off * apart.bias_error) / texture)
 
     def beside_the_reference(self, candidate: Candidate, floor: Belief) -> Belief:
         """Return a floor with what the reference itself may be off by, where that is not level explicit."""
@@ -410,12 +433,15 @@ class _Planning:
             return off
         return Belief(math.hypot(floor.value, off.value), math.hypot(floor.error, off.error))
 
-    def faded(self, floor: Belief, bias: float, bias_error: float, k: int) -> Belief:
-        """Return what is left of a floor after k more explicit grains: its texture falls, its bias does not."""
-        if not k:
+    def faded(self, floor: Belief, bias: float, bias_error: float, before: int, k: int) -> Belief:
+        """Return what is left of a floor with k explicit grains, of one with fewer: its texture falls, its bias does
+        not. Where the first of them go by pixel, all pixels come to what the one is left with that has most."""
+        if k == before:
             return floor
         off = math.hypot(bias, bias_error)
-        left = math.exp(-k / min(self.per_e, self.length))
+        left = math.exp((before - k) / min(self.per_e, self.length))
+        if self.far and not before:
+            left = min(1.0, self.ratio * left)
         texture = math.sqrt(max(floor.value**2 - off**2, 0.0)) * left
         value = math.hypot(texture, min(off, floor.value))
         return Belief(value, math.hypot(math.hypot(floor.error * left, FADING * texture), 0.5 * min(bias_error, value)))
@@ -436,7 +462,10 @@ class _Planning:
         """Return variance and time of a sample, by its pilot or from those of others, and whether it was the former."""
         own = self.pilots.get(candidate)
         assert self.reference is not None
-        best = self.pilots[self.reference].seen
+        best = self.of_reference(self.pilots[self.reference])
+        if self.hidden(candidate):
+            seen = self.of_reference(own) if own is not None and own.each else best
+            return seen._replace(variance=math.inf), own is not None
         if own is not None and own.each:
             return self.with_suns(own), True
         level, k = candidate.level, candidate.explicit_grains
@@ -445,7 +474,7 @@ class _Planning:
         plain = self.pilots.get(Candidate(level))
         near = next((self.pilots[Candidate(o)] for o in ("teleport-memory", "teleport", "volume")
                      if Candidate(o) in self.pilots), None)  # fmt: skip
-        chain = (plain or near or self.pilots[self.reference]).seen
+        chain = self.of_reference(plain or near or self.pilots[self.reference])
         if not k:
             return chain, False
         share = 1.0 - math.exp(-k * self.coverage / chain.events) if chain.events else 0.0
@@ -454,9 +483,18 @@ class _Planning:
         }
         return chain._replace(**mixed), False
 
+    def of_reference(self, pilot: Pilot) -> Seen:
+        """Return what a pilot saw, its variance over the mean of the reference squared, where that is to be believed:
+        errors are over the mean of the true picture, not of one that is too bright."""
+        assert self.reference is not None
+        seen, best = pilot.seen, self.pilots[self.reference]
+        if not (seen.mean > 0.0 and self.trusted(best)):
+            return seen
+        return seen._replace(variance=seen.variance * (seen.mean / best.seen.mean) ** 2)
+
     def with_suns(self, pilot: Pilot) -> Seen:
         """Return what a pilot saw; its variance is not less than lights that it has hardly met will make it."""
-        seen = pilot.seen
+        seen = self.of_reference(pilot)
         if self.trusted(pilot):
             return seen
         return seen._replace(variance=max(seen.variance, 0.1 * self.coverage * self.chance))
@@ -465,7 +503,8 @@ class _Planning:
 
     def choose(self, found: list[Prediction]) -> Prediction:
         """Return the cheapest that is sure enough to meet the target; if there is a time and none does, the one with
-        the least error in it."""
+        the least error in it. None is taken of whose noise nothing is known, unless nothing is of any."""
+        found = [p for p in found if math.isfinite(p.variance)] or found
         if self.spp is not None:
             fit = [p for p in found if p.floor.high < self.target]
             return min(fit, key=lambda p: p.turn) if fit else min(found, key=lambda p: p.floor.high)
@@ -478,6 +517,11 @@ class _Planning:
             return min(found, key=lambda p: p.floor.high)
         alike = [p for p in found if p.safe_seconds(self.target) <= TIE * takes]
         return min(alike, key=lambda p: p.floor.high)
+
+
+def _singly(candidate: Candidate) -> bool:
+    """Return whether a candidate meets single grains, whose light is met by chance."""
+    return candidate.explicit_grains > 0 or LEVELS[candidate.level].traits.packed
 
 
 def loaded(scene: Scene) -> tuple[Scene, list[Table]]:

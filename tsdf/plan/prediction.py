@@ -81,7 +81,10 @@ class Plan:
     notes : tuple of str
         What the planner does not know.
     spent : float
-        Time that planning took, after packings, records and kernels were made [s].
+        Time that planning took of processors that have nothing else to do: worlds that were built, with their packings
+        and records, and pilots; machine code is not counted [s].
+    clock : float
+        Time that it took by the clock, everything counted [s].
     threads : int
     load : float
         How many times as long things take now as they would if processors had nothing else to do.
@@ -96,6 +99,7 @@ class Plan:
     needs: tuple[str, ...]
     notes: tuple[str, ...]
     spent: float
+    clock: float
     threads: int
     load: float = 1.0
 

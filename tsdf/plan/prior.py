@@ -88,20 +88,21 @@ def atlas() -> Points:
         np.unique([row[key] for row in rows]) for key in ("packing_fraction", "layer", "albedo")
     )
     transport = np.full((len(grains), len(fractions)), math.nan)
-    squares = {level: np.full((len(grains), len(fractions), len(layers), len(albedos)), math.nan) for level in LEVELS}
-    counts = {level: np.zeros(square.shape) for level, square in squares.items()}
+    shape = (len(grains), len(fractions), len(layers), len(albedos))
+    squares, counts = ({level: np.zeros(shape) for level in LEVELS} for _ in range(2))
     for row in rows:
         g, f = grains.index(str(row["grain"])), int(np.searchsorted(fractions, row["packing_fraction"]))
         transport[g, f] = row["transport"]
         at = (g, f, int(np.searchsorted(layers, row["layer"])), int(np.searchsorted(albedos, row["albedo"])))
         through = min(1.0, (1.0 - row["reflectance"]) / row["reflectance"])  # what little comes through counts little
-        level, sum_ = str(row["level"]), 0.0
         for name, weight in (("reflectance", 1.0), ("transmittance", through)):
-            off, known_to = row[f"{name}_deviation"], row[f"{name}_deviation_error"]
-            sum_ += weight**2 * max(off**2 - known_to**2, LEAST**2)
-        squares[level][at] = np.nansum([squares[level][at], sum_])
-        counts[level][at] += 2.0
-    error = {level: np.sqrt(squares[level] / np.maximum(counts[level], 1.0)) for level in LEVELS if level != "explicit"}
+            square = weight**2 * (row[f"{name}_deviation"] ** 2 - row[f"{name}_deviation_error"] ** 2)
+            if math.isfinite(square):
+                squares[str(row["level"])][at] += square
+                counts[str(row["level"])][at] += 1.0
+    with np.errstate(invalid="ignore"):  # noise goes out with the mean, so it is no error until all rows are in
+        means = {level: squares[level] / counts[level] for level in LEVELS if level != "explicit"}
+    error = {level: np.sqrt(np.maximum(mean, LEAST**2)) for level, mean in means.items()}
     return Points(np.array([cosines[g] for g in grains]), fractions, layers, albedos, transport, error)
 
 

@@ -30,6 +30,8 @@ def short(prediction: Prediction) -> str:
 
 def percent(value: float) -> str:
     """Return a share in per cent with two digits."""
+    if not math.isfinite(value):
+        return "not known"
     return f"{100.0 * value:.2g} %" if abs(value) < 0.995 else f"{100.0 * value:.0f} %"
 
 
@@ -49,6 +51,8 @@ def _first(plan: Plan) -> str:
     p = plan.chosen
     far = ", fewer where a pixel covers more" if plan.fewer_far else ""
     takes = p.seconds(plan.target)
+    if math.isinf(p.variance):
+        return f"take {p.candidate}{far}: nothing is known of its noise"
     if plan.seconds is not None and plan.able is not None and not takes <= plan.able:
         after = f"an error of {percent(p.error(plan.able))} after {span(plan.seconds)}"
         met = f"none is sure to meet {percent(plan.target)} in that time, and this one has least"
@@ -114,12 +118,19 @@ def table(plan: Plan) -> list[str]:
             f"{100 * p.bias:+.2f} ± {100 * p.bias_error:.2f}",
             f"{100 * p.texture:.2f} ± {100 * p.texture_error:.2f}",
             f"{100 * p.floor.value:.2f} ± {100 * p.floor.error:.2f}",
-            span(p.seconds(plan.target)) if math.isfinite(p.seconds(plan.target)) else "never",
+            _when(p, plan.target),
         ]
         row += [percent(p.error(after))] if after is not None else []
         rows.append([*row, "pilot" if p.piloted else "others"])
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def _when(p: Prediction, target: float) -> str:
+    takes = p.seconds(target)
+    if math.isinf(p.variance):
+        return "not known"
+    return span(takes) if math.isfinite(takes) else "never"
 
 
 def facts(plan: Plan) -> dict[str, Any]:
@@ -139,6 +150,7 @@ def facts(plan: Plan) -> dict[str, Any]:
         "needs": list(plan.needs),
         "notes": list(plan.notes),
         "planning_seconds": round(plan.spent, 2),
+        "planning_clock_seconds": round(plan.clock, 2),
         "candidates": [
             {
                 "level": p.candidate.level,
@@ -150,7 +162,7 @@ def facts(plan: Plan) -> dict[str, Any]:
                 "texture_error": p.texture_error,
                 "floor": p.floor.value,
                 "floor_error": p.floor.error,
-                "variance_of_a_sample": p.variance,
+                "variance_of_a_sample": number(p.variance),
                 "seconds_per_sample_of_all_pixels": number(p.turn),
                 "noise": number(p.noise(plan.able)) if plan.able is not None else None,
                 "error": number(p.error(plan.able)) if plan.able is not None else None,

@@ -6,6 +6,9 @@ The error of a picture, wherever one is charted or predicted, is over the mean r
 background included, and has three parts. Bias: the difference of the means. Texture: root mean square over pixels of
 what else the expected picture differs by from the truth of the same packing. Noise: the standard error of pixels, as
 `Picture.relative_error`. The whole is the root of the sum of their squares.
+
+A plan is of one picture, so its bias and texture are against the scene's own packing. A chart is of a kind of scene:
+its bias is that of the mean over packings, and what the difference to one packing has beside that counts as texture.
 """
 
 from collections.abc import Sequence
