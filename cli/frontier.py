@@ -25,7 +25,8 @@ from tsdf.errors import UsageError
 if TYPE_CHECKING:
     from tsdf.study.frontier import Frontier
 
-TEXTS = (".json", ".csv", ".md")
+SAVED = ".json"  # results that are drawn again
+TEXTS = (SAVED, ".csv", ".md")
 CHARTS = (".pdf", ".svg", ".png")
 ALL = "frontier"  # the chart of several scenes
 MOST_GRAINS = 1_000_000
@@ -63,6 +64,13 @@ def main(
     chosen = named_levels(levels, LEVELS)
     explicit = _grains(grains)
     check_numbers(seed, runs=runs, width=width, threads=threads)
+    asked = {
+        "levels": levels, "grains": grains, "seconds": seconds, "runs": runs, "width": width, "seed": seed,
+        "threads": threads,
+    }  # fmt: skip
+    vain = [f"--{name}" for name, value in asked.items() if value is not None]
+    if vain and all(scene.suffix == SAVED for scene in scenes):
+        raise UsageError(f"{', '.join(vain)}: saved results are only drawn again; leave it out, or give a scene")
     names = [scene.stem for scene in scenes]
     if twice := {name for name in names if names.count(name) > 1 or (name == ALL and len(names) > 1)}:
         raise UsageError(f"two results would be called {plain(min(twice))}; give scenes files of different names")
@@ -72,7 +80,7 @@ def main(
     from tsdf.study import frontier, frontier_files
     from tsdf.study.candidates import candidates
 
-    saved = {scene: frontier_files.read(scene) for scene in scenes if scene.suffix == ".json"}
+    saved = {scene: frontier_files.read(scene) for scene in scenes if scene.suffix == SAVED}
     read = {scene: resized(load(scene), width) for scene in scenes if scene not in saved}
     written = [f"{name}{suffix}" for name in names for suffix in (*TEXTS, *CHARTS)]
     drawn_again = [scene for scene in saved if _own(scene, out)]  # the same bytes once more
@@ -106,7 +114,9 @@ def main(
         if len(scenes) > 1 and found:
             draw_all(list(found.values()), out)
     if not quiet:
-        say("\n".join(frontier_files.markdown(one) for one in found.values()).removesuffix("\n"))
+        files = (plain(out / f"{scene.stem}.md") for scene in found)
+        shown = map(frontier_files.terminal, found.values(), files)
+        say("\n".join(shown).removesuffix("\n"))
     for one in found.values():
         if lost := sum(row.lost for row in one.rows):
             click.echo(f"warning: {plain(one.scene)}: {lost} paths were given up", err=True)

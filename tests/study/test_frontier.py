@@ -5,6 +5,7 @@ import io
 import json
 import math
 import os
+import re
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -173,13 +174,14 @@ def test_noise_and_bias_are_taken_apart(ball: Scene) -> None:
 def test_runs_share_no_random_numbers_but_packings(ball: Scene) -> None:
     """Another stream for each candidate, run and doubling; the truth and the candidates of a run are in one packing,
     and runs are not, nor are they the truth of each other."""
+    ways = [c._replace(leap=leap) for c in ALL for leap in (None, 0.0, 3.0, 3.5)]
     streams = {
-        (stream * frontier.MOST_RUNS + run) * (frontier.DOUBLINGS + 1) + step + 1
-        for stream in {0} | {1 + list(LEVELS).index(c.level) + len(LEVELS) * c.explicit_grains for c in ALL}
+        ((stream * frontier.MOST_RUNS + run) * (frontier.DOUBLINGS + 1) + step + 1) % frontier.LARGEST_SEED
+        for stream in {0, *map(frontier.stream_of, ways)}
         for run in range(10)
         for step in range(frontier.DOUBLINGS + 1)
     }
-    assert len(streams) == (1 + len(ALL)) * 10 * (frontier.DOUBLINGS + 1)
+    assert len(streams) == (1 + len(ways)) * 10 * (frontier.DOUBLINGS + 1)
     packings = frontier._Packings(ball)
     worlds = [build(taken(ball, c), c.level) for c in (Candidate("explicit"), Candidate("teleport", 2))]
     first, second = ([packings.of(world, run).packed for world in worlds] for run in (0, 1))
@@ -283,6 +285,13 @@ def test_results_are_read_again(found: Frontier, tmp_path: Path) -> None:
         lambda held: held["candidates"][1]["runs"].update(noise=["a"] * RUNS),
         lambda held: held["candidates"][1]["runs"].update(noise=[math.nan] * RUNS),
         lambda held: held.update(width=1e999),
+        lambda held: held.update(width="12"),
+        lambda held: held.update(scene=None),
+        lambda held: held.update(notes="x"),
+        lambda held: held.update(notes=[1]),
+        lambda held: held["regions"].pop("whole"),
+        lambda held: held["candidates"][1].update(lost=True),
+        lambda held: held["candidates"][1]["runs"].update(flip="12345678"),
     ],
 )
 def test_damaged_results_are_one_line(found: Frontier, harm: Callable[[dict], Any], tmp_path: Path) -> None:
@@ -292,6 +301,29 @@ def test_damaged_results_are_one_line(found: Frontier, harm: Callable[[dict], An
     with pytest.raises(TSDFError, match=r"ball.json: (does not hold|has the format)") as caught:
         frontier_files.read(tmp_path / "ball.json")
     assert "\n" not in str(caught.value)
+
+
+def test_a_screen_shows_the_table_and_where_the_rest_is(found: Frontier) -> None:
+    """No line is wider than 120; columns are left out where they do not fit, those of regions first."""
+    regions = {"whole": 1.0} | {f"region of name {k}": 0.1 for k in range(9)}
+    rows = [replace(row, bias=dict.fromkeys(regions, row.bias["whole"])) for row in found.rows]
+    many = replace(found, regions=regions, rows=tuple(rows), notes=("many words " * 40,))
+    few = replace(found, regions={"whole": 1.0})
+    heads = []
+    for one in (few, many):
+        text = frontier_files.terminal(one, "charts/ball.md")
+        lines = text.splitlines()
+        assert max(map(len, lines)) <= 120 and lines[-1].endswith("rank: charts/ball.md") and "|" not in text
+        heads.append(next(re.split("  +", line) for line in lines if line.startswith("candidate ")))
+        assert sum(line.startswith(f"{row.candidate}  ") for line in lines for row in one.rows) == len(ALL)
+    assert " ".join(text.split()).count("many words") == 40
+    always = ["candidate", "place", "floor [%]", "bias, whole [%]", "FLIP", "us per sample", "s to 1 %"]
+    for some in heads:
+        assert [head for head in some if head in always] == always
+    assert sum("region" in head for head in heads[1]) < 2
+    slim = tuple(replace(row, squares=(1e-4,) * RUNS) for row in few.rows)
+    slimmer = frontier_files.terminal(replace(few, rows=slim), "a.md")
+    assert "texture [%]" in slimmer and "kB" in slimmer
 
 
 @pytest.mark.parametrize(
@@ -394,11 +426,12 @@ def test_command_writes_results_and_draws_them_again(tmp_path: Path, capsys: pyt
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     assert set(before) == names
     report = capsys.readouterr().out
-    assert report == "\n".join((out / f"{name}.md").read_text() for name in ("one", "two"))
+    assert all(f"{out / name}.md\n" in report for name in ("one", "two"))
     saved = [out / "one.json", out / "two.json"]
     assert status(*saved, "--out", tmp_path / "again") == 0
+    shown = capsys.readouterr().out
+    assert shown.replace(str(tmp_path / "again"), str(out)).split() == report.split()
     assert {path.name: path.read_bytes() for path in (tmp_path / "again").iterdir()} == before
-    assert capsys.readouterr().out == report
     assert status(saved[0], "--out", out, "--quiet") == 0
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
@@ -409,8 +442,10 @@ def test_command_writes_results_and_draws_them_again(tmp_path: Path, capsys: pyt
         (["scene.toml", "--out", "o", "--levels", "teleprot"], 2, "did you mean teleport"),
         (["scene.toml", "--out", "o", "--grains", "1,-2"], 2, "--grains"),
         (["scene.toml", "--out", "o", "--grains", "1.5"], 2, "--grains"),
-        (["scene.toml", "--out", "o", "--runs", "1"], 2, "runs"),
-        (["scene.toml", "--out", "o", "--seconds", "0"], 2, "seconds"),
+        (["scene.toml", "--out", "o", "--runs", "1"], 2, "--runs is"),
+        (["scene.toml", "--out", "o", "--seconds", "0"], 2, "--seconds is"),
+        (["empty.json", "--out", "o", "--levels", "volume", "--seed", "0"], 2, "--levels, --seed: saved results"),
+        (["empty.json", "scene.toml", "--out", "o", "--seconds", "1"], 1, "empty.json"),
         (["scene.toml", "other/scene.toml", "--out", "o"], 2, "two results"),
         (["nothing.toml", "--out", "o"], 1, "nothing.toml"),
         (["nothing.json", "--out", "o"], 1, "nothing.json"),

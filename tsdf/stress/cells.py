@@ -116,6 +116,8 @@ class Row:
         Methods of ours that are not claimed to hold here, and where this is documented.
     quick : bool
         Whether it is a row of the quick form.
+    claimed : bool
+        Whether methods of ours that are not `known` to fail are claimed to hold.
     """
 
     name: str
@@ -127,6 +129,7 @@ class Row:
     measure: Callable[["Setting"], Iterator[Measured]]
     known: Mapping[str, str] = field(default_factory=dict)
     quick: bool = True
+    claimed: bool = True
 
 
 def verdict(value: float, error: float, limit: float) -> str:

@@ -12,7 +12,7 @@ from itertools import groupby, zip_longest
 from tsdf.stress.cells import BEYOND, FAILS, HOLDS, NAIVE, NOT, OURS, REFUSED, TRUTH, UNSURE, WITHIN, Cell, Row
 from tsdf.stress.rows import Done, Report
 
-WIDTHS = (38, 38, 38)  # columns of a terminal: the situation, ours, others; with what is between them 120
+COLUMNS, NARROW = 120, 20  # of a terminal, all; least of each of three: the situation, ours, others
 WORDS = {HOLDS: "holds", FAILS: "FAILS", UNSURE: "?", NOT: "-", TRUTH: "truth"}
 # To be told apart by all eyes (Okabe & Ito 2008)
 COLOURS = {HOLDS: "#56b4e9", FAILS: "#d55e00", UNSURE: "#f0e442", NOT: "#ffffff", TRUTH: "#dddddd", "known": "#e69f00"}
@@ -68,21 +68,28 @@ def _said(cell: Cell) -> str:
     return f"{word(cell):5s} {cell.measured.method} {figure(cell.measured.value, cell.measured.error)}".rstrip()
 
 
-def terminal(report: Report) -> str:
-    """Return the report as a table of at most 120 columns."""
-    rule = "-+-".join("-" * width for width in WIDTHS)
+def _wrapped(text: str, width: int) -> list[str]:
+    return textwrap.wrap(text, width, subsequent_indent="  ", break_on_hyphens=False)
+
+
+def terminal(report: Report, columns: int = COLUMNS) -> str:
+    """Return the report as a table that fits into so many columns, from 66 to 120."""
+    width = max(NARROW, (min(columns, COLUMNS) - 6) // 3)
+    rule = "-+-".join(["-" * width] * 3)
+
+    def side_by_side(*texts: list[str]) -> list[str]:
+        return [" | ".join(f"{t:{width}s}" for t in line).rstrip() for line in zip_longest(*texts, fillvalue="")]
+
     lines = []
     for name, some in _groups(report):
-        lines += [
-            " | ".join(f"{text:{w}s}" for text, w in zip((name[: WIDTHS[0]], "ours", "others"), WIDTHS, strict=True)),
-            rule,
-        ]
+        lines += [*side_by_side(textwrap.wrap(name, width), ["ours"], ["others"]), rule]
         for one in some:
-            left = textwrap.wrap(f"{one.row.name}: {one.row.title}", WIDTHS[0])
-            left += textwrap.wrap(about(one.row), WIDTHS[0], initial_indent="  ", subsequent_indent="  ")
-            columns = [left, *([_said(c) for c in one.cells if c.ours is ours] for ours in (True, False))]
-            for texts in zip_longest(*columns, fillvalue=""):
-                lines.append(" | ".join(f"{t[:w]:{w}s}" for t, w in zip(texts, WIDTHS, strict=True)).rstrip())
+            left = textwrap.wrap(f"{one.row.name}: {one.row.title}", width)
+            left += textwrap.wrap(about(one.row), width, initial_indent="  ", subsequent_indent="  ")
+            said = ([_said(c) for c in one.cells if c.ours is ours] for ours in (True, False))
+            lines += side_by_side(left, *([line for text in some for line in _wrapped(text, width)] for some in said))
+            for note in _noted([cell for cell in one.cells if cell.verdict == NOT]):
+                lines += _wrapped(f"- {note}", 3 * width + 6)
             lines.append(rule)
         lines.append("")
     return "\n".join([*lines, *summary(report)])
@@ -128,15 +135,15 @@ def markdown(report: Report) -> str:
             by = {cell.measured.method: cell for cell in one.cells}
             cells = [_marked(by[method]) if method in by else "" for method in ours]
             rest = "<br>".join(f"{method}: {_marked(cell)}" for method, cell in by.items() if method not in OURS)
-            lines.append(f"| {one.row.title} | {about(one.row)} | {' | '.join(cells)} | {rest} |")
-        lines += ["", *(f"- {one.row.title}: {'; '.join(said)}." for one in some if (said := _noted(one))), ""]
+            lines.append(f"| `{one.row.name}` {one.row.title} | {about(one.row)} | {' | '.join(cells)} | {rest} |")
+        lines += ["", *(f"- {one.row.title}: {'; '.join(said)}." for one in some if (said := _noted(one.cells))), ""]
     return "\n".join(lines)
 
 
-def _noted(one: Done) -> list[str]:
+def _noted(cells: Iterable[Cell]) -> list[str]:
     """Return what was noted beside figures, each note once, with the methods that it is of."""
     notes: dict[str, list[str]] = {}
-    for cell in one.cells:
+    for cell in cells:
         if cell.measured.note and cell.verdict != TRUTH:
             notes.setdefault(cell.measured.note, []).append(cell.measured.method)
     return [f"{', '.join(methods)}: {note}" for note, methods in notes.items()]
@@ -166,6 +173,7 @@ def notes(report: Report) -> list[str]:
             file, _, section = known.partition(", ")
             anchor = re.sub(r"[^\w\- ]", "", section.lower()).replace(" ", "-")
             where = f"[{section}]({file}#{anchor})" if known else "**claimed to hold**"
+            where = where if known or one.row.claimed else "nothing is claimed"
             lines.append(
                 f"- {one.row.title}, {one.row.figure}: {said} ({where}). " + f"Holds: {', '.join(good) or 'none'}."
             )
@@ -268,6 +276,11 @@ def page(report: Report, command: str) -> str:
             *(found or ["Nothing."]),
             "",
             "## The matrix",
+            "",
+            "The first word names the row: `tsdf-stress --rows restart,far` measures those two. Of a table,",
+            "`tsdf-stress TABLE`, three rows more are measured: `own-sums`, whether what it holds sums to 1,",
+            "`own-furnace`, whether levels keep all light, and `own-slab`, levels against its grains one by one; of",
+            "the last nothing is claimed, and exit status 1 never comes from it.",
             "",
             markdown(report).rstrip(),
             "",

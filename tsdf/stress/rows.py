@@ -46,7 +46,7 @@ class Report:
     @property
     def broken(self) -> list[tuple[Row, Cell]]:
         """Where a method of ours fails though it is claimed to hold."""
-        return [(one.row, cell) for one in self.done for cell in one.cells if cell.broken]
+        return [(one.row, cell) for one in self.done for cell in one.cells if one.row.claimed and cell.broken]
 
     @property
     def known(self) -> list[tuple[Row, Cell]]:
@@ -76,7 +76,7 @@ def chosen(names: str | None, setting: Setting) -> list[Row]:
     for name in (part.strip() for part in names.split(",")):
         if name not in there:
             near = get_close_matches(name, there, 1)
-            hint = f"did you mean {near[0]}?" if near else f"rows are {', '.join(there)}"
+            hint = f"did you mean {near[0]}?" if near else "see tsdf-stress --help, which lists them"
             if any(row.name == name for row in ROWS):
                 hint = "it is about one table: name it"
             raise UsageError(f"--rows: no row {name!r}; {hint}")

@@ -9,7 +9,9 @@ all threads together. `ranking` orders candidates, `frontier_files` writes resul
 """
 
 import math
+import struct
 import threading
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -215,9 +217,9 @@ def measure(
         In one line; a candidate that alone is impossible becomes a note instead.
     """
     if not LEAST_RUNS <= runs <= MOST_RUNS:
-        raise UsageError(f"runs are {LEAST_RUNS} to {MOST_RUNS}, for their spread is the error, not {runs}")
+        raise UsageError(f"--runs is {LEAST_RUNS} to {MOST_RUNS}, for their spread is the error, not {runs}")
     if not 0.0 < seconds < math.inf:
-        raise UsageError(f"seconds are a finite number above 0, not {seconds}")
+        raise UsageError(f"--seconds is a finite number above 0, not {seconds}")
     stop, told = stop or threading.Event(), progress or (lambda share, word: None)
     notes: list[str] = []
     told(0.0, "reading the scene")
@@ -334,6 +336,14 @@ def _truth(scene: Scene, notes: list[str]) -> Way:
     raise failed
 
 
+def stream_of(candidate: Candidate) -> int:
+    """Return the stream of random numbers of a candidate, from 1 on; another for each, whatever else is measured."""
+    stream = 1 + list(LEVELS).index(candidate.level) + len(LEVELS) * candidate.explicit_grains
+    if candidate.leap is not None:  # above all streams without: no chain has 2^24 explicit grains
+        stream += (1 + zlib.crc32(struct.pack("<d", candidate.leap))) << 24
+    return stream
+
+
 def _possible(
     scene: Scene, chosen: Sequence[Candidate], truth: Way, notes: list[str], told: Callable[[float, str], None],
     stop: threading.Event,
@@ -352,8 +362,7 @@ def _possible(
         except TSDFError as error:
             failed.setdefault(str(error), []).append(str(candidate))
             continue
-        stream = 1 + list(LEVELS).index(candidate.level) + len(LEVELS) * candidate.explicit_grains
-        ways.append(Way(candidate, world, stream))
+        ways.append(Way(candidate, world, stream_of(candidate)))
         notes += [note for note in world.notes if note not in notes]
     notes += [f"left out: {', '.join(names)}: {error}" for error, names in failed.items()]
     if not ways:

@@ -12,6 +12,7 @@ import io
 import json
 import math
 import os
+import textwrap
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -25,6 +26,7 @@ from tsdf.study.ranking import CONFIDENCE, Pair, best, mean_of, places, ranked
 
 FORMAT = "tsdf-frontier 1"
 TIMES = (0.1, 1.0, 10.0, 100.0, 1000.0, 10000.0)  # [s] of a processor, at which the best is named
+COLUMNS = 120  # of a screen
 TARGET = 0.01  # relative standard error of pixels to which times are given
 
 
@@ -98,26 +100,26 @@ def read(path: str | os.PathLike[str]) -> Frontier:
             raise TSDFError(f"{name}: has the format {held['format']!r:.50}, not {FORMAT!r}; measure the scene again")
         rows = tuple(_row(one) for one in held["candidates"])
         found = Frontier(
-            scene=str(held["scene"]),
-            width=int(held["width"]),
-            height=int(held["height"]),
-            seed=int(held["seed"]),
+            scene=_text(held["scene"]),
+            width=_whole(held["width"], 1),
+            height=_whole(held["height"], 1),
+            seed=_whole(held["seed"]),
             truth=_level(held["truth"]["level"]),
-            truth_samples=int(held["truth"]["samples"]),
+            truth_samples=_whole(held["truth"]["samples"], 1),
             truth_seconds=_numbers(held["truth"]["seconds"]),
             truth_noise=_numbers(held["truth"]["noise"]),
-            regions={str(region): float(share) for region, share in held["regions"].items()},
+            regions=dict(zip(held["regions"], _numbers([*held["regions"].values()]), strict=True)),
             rows=rows,
-            notes=tuple(map(str, held["notes"])),
-            asked=int(held["asked"]),
+            notes=tuple(map(_text, _listed(held["notes"]))),
+            asked=_whole(held["asked"]),
         )
         runs = found.runs
         kept = [(row.seconds, row.noise, row.squares, row.flip, *row.bias.values()) for row in rows]
         kept += [tuple(values for _, values in row.curve) for row in rows]
         if runs < 2 or not rows or any(len(values) != runs for row in kept for values in row):
             raise ValueError("runs")
-        if any(row.samples < 1 or row.pixels < 1 or "whole" not in row.bias for row in rows):
-            raise ValueError("samples")
+        if "whole" not in found.regions or any(set(row.bias) != set(found.regions) for row in rows):
+            raise ValueError("regions")
     except OSError as error:
         raise TSDFError(f"cannot read {name}: {error.strerror or error}; give results of tsdf-frontier") from error
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
@@ -129,17 +131,19 @@ def _row(one: dict[str, Any]) -> Measured:
     runs = one["runs"]
     leap = one["leap"]
     return Measured(
-        candidate=Candidate(_level(one["level"]), int(one["explicit_grains"]), None if leap is None else float(leap)),
-        samples=int(one["samples"]),
-        pixels=int(one["pixels"]),
-        bytes=int(one["bytes"]),
+        candidate=Candidate(
+            _level(one["level"]), _whole(one["explicit_grains"]), None if leap is None else _number(leap)
+        ),
+        samples=_whole(one["samples"], 1),
+        pixels=_whole(one["pixels"], 1),
+        bytes=_whole(one["bytes"]),
         seconds=_numbers(runs["seconds"]),
         noise=_numbers(runs["noise"]),
         squares=_numbers(runs["squares"]),
-        bias={str(name): _numbers(values) for name, values in runs["bias"].items()},
+        bias={name: _numbers(values) for name, values in runs["bias"].items()},
         flip=_numbers(runs["flip"]),
-        curve=tuple((float(spent), _numbers(values)) for spent, values in runs["curve"]),
-        lost=int(one["lost"]),
+        curve=tuple((_number(spent), _numbers(values)) for spent, values in runs["curve"]),
+        lost=_whole(one["lost"]),
     )
 
 
@@ -149,11 +153,32 @@ def _level(name: str) -> str:
     return name
 
 
-def _numbers(values: Sequence[float]) -> tuple[float, ...]:
-    numbers = tuple(float(value) for value in values)
-    if not all(map(math.isfinite, numbers)):
-        raise ValueError("not finite")
-    return numbers
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError("not a text")
+    return value
+
+
+def _listed(value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        raise TypeError("not a list")
+    return value
+
+
+def _whole(value: Any, least: int = 0) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        raise ValueError("not such a whole number")
+    return value
+
+
+def _number(value: Any) -> float:
+    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
+        raise ValueError("not a finite number")
+    return float(value)
+
+
+def _numbers(values: Any) -> tuple[float, ...]:
+    return tuple(map(_number, _listed(values)))
 
 
 # ----------------------------------------------------------------------------------------------- reports
@@ -200,16 +225,15 @@ def csv_text(frontier: Frontier) -> str:
 def markdown(frontier: Frontier) -> str:
     """Return the report: what was measured, the table, the best by time, the ranking, notes."""
     f = frontier
-    pixels = math.sqrt(float(np.mean(np.square(f.truth_noise))))
-    shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in f.regions.items() if name != "whole")
+    heads, *rows = _table(f)
     text = [
         f"# {_cell(f.scene)}: error against processor time",
         "",
-        f"{f.width} x {f.height} pixels, {f.runs} runs, a packing each, {f.spent:.0f} s of processor time."
-        + f" **Interrupted: {f.asked} runs were asked for.**" * (f.runs < f.asked),
-        f"Truth: {f.truth}, its pixels known to {100.0 * pixels:.2g} % in a run. Regions: {shares or 'one'}.",
+        *_measured(f),
         "",
-        *_table(f),
+        f"| {' | '.join(heads)} |",
+        "|---" * len(heads) + "|",
+        *(f"| {' | '.join(row)} |" for row in rows),
         "",
         "Errors in % of the truth's mean, in brackets the standard error of the last digits, from the spread of the",
         "runs. Floor: root mean square over pixels of what is left when all noise is gone, bias and texture, with its",
@@ -232,11 +256,47 @@ def markdown(frontier: Frontier) -> str:
     return "\n".join(text) + "\n"
 
 
-def _table(f: Frontier) -> list[str]:
+def terminal(frontier: Frontier, file: str) -> str:
+    """Return what a screen shows of the report in `file`: its table, without the columns that do not fit, and notes."""
+    table = _table(frontier)
+    lines = _aligned(table)
+    regions = [f"bias, {name} [%]" for name in reversed(list(frontier.regions)) if name != "whole"]
+    for name in (*regions, "texture [%]", "kB"):
+        if max(map(len, lines)) > COLUMNS:
+            place = table[0].index(name)
+            table = [row[:place] + row[place + 1 :] for row in table]
+            lines = _aligned(table)
+    last = f"All of it, with what the columns are and how candidates rank: {file}"
+    text = [frontier.scene, *_wrapped(_measured(frontier)), "", *lines, "", *_wrapped([*frontier.notes, last])]
+    return "\n".join(text) + "\n"
+
+
+def _wrapped(lines: Sequence[str]) -> list[str]:
+    wrap = textwrap.TextWrapper(COLUMNS, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+    return [part for line in lines for part in wrap.wrap(line)]
+
+
+def _aligned(table: Sequence[Sequence[str]]) -> list[str]:
+    wide = [max(map(len, column)) for column in zip(*table, strict=True)]
+    return ["  ".join(f"{cell:{w}s}" for cell, w in zip(row, wide, strict=True)).rstrip() for row in table]
+
+
+def _measured(f: Frontier) -> list[str]:
+    pixels = math.sqrt(float(np.mean(np.square(f.truth_noise))))
+    shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in f.regions.items() if name != "whole")
+    return [
+        f"{f.width} x {f.height} pixels, {f.runs} runs, a packing each, {f.spent:.0f} s of processor time."
+        + f" **Interrupted: {f.asked} runs were asked for.**" * (f.runs < f.asked),
+        f"Truth: {f.truth}, its pixels known to {100.0 * pixels:.2g} % in a run. Regions: {shares or 'one'}.",
+    ]
+
+
+def _table(f: Frontier) -> list[list[str]]:
+    """Return the heads of the table and its rows, as many cells each."""
     regions = list(f.regions)
     heads = ["candidate", "place", "floor [%]", "texture [%]", *(f"bias, {name} [%]" for name in regions), "FLIP",
              "us per sample", f"s to {100.0 * TARGET:g} %", "kB"]  # fmt: skip
-    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    lines = [heads]
     for row, (first, last) in zip(f.rows, places(len(f.rows), _pairs(f)), strict=True):
         cells = [
             str(row.candidate),
@@ -252,7 +312,7 @@ def _table(f: Frontier) -> list[str]:
             f"{mean_of(row.noise_seconds).value / TARGET**2:.3g}",
             f"{row.bytes / 1000.0:.3g}",
         ]
-        lines.append(f"| {' | '.join(cells)} |")
+        lines.append(cells)
     return lines
 
 
