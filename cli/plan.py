@@ -1,6 +1,8 @@
 """``tsdf-plan``: which level a scene needs, and what each would cost and get wrong."""
 
 import json
+import shutil
+import textwrap
 from pathlib import Path
 
 import click
@@ -70,7 +72,10 @@ def main(
     if as_json:
         say(text)
     elif not (quiet and out is not None):
-        for line in (*plan.why, *(f"table: {need}" for need in plan.needs), "", *report.table(plan)):
+        width = max(shutil.get_terminal_size((120, 24)).columns, 40)
+        for line in (*plan.why, *(f"table: {need}" for need in plan.needs)):
+            say(textwrap.fill(plain(line), width, subsequent_indent="  ", break_on_hyphens=False))
+        for line in ("", *report.table(plan)):
             say(plain(line))
     if not quiet:
         for note in plan.notes:

@@ -33,7 +33,8 @@ def test_what_it_says(folder: Path) -> None:
     """Three lines, what the table needs, a table of all candidates; the same as a file."""
     result = run(folder, "--target", 0.1, "--out", folder / "plan.json", "--seconds", 10)
     assert result.exit_code == 0, result.stderr
-    first, second, third, need, *rest = result.stdout.splitlines()
+    assert max(map(len, result.stdout.splitlines())) <= 120
+    first, second, third, need, *rest = result.stdout.replace("\n  ", " ").splitlines()
     assert first.startswith("take ") and second.startswith("because ") and third.startswith("runner-up: ")
     assert need.startswith("table: ") and "--memory 64" in need
     facts = json.loads((folder / "plan.json").read_text())

@@ -74,7 +74,7 @@ def test_a_dense_slab_seen_from_afar(far: Plan) -> None:
     assert of(far, "teleport").bias > 2.0 * of(far, "teleport").bias_error > 0.0
     assert of(far, "teleport").floor.value > of(far, "teleport-memory").floor.value
     assert far.chosen.floor.high < far.target and len(far.why) == 3
-    assert far.chosen.seconds(far.target) <= of(far, "explicit").seconds(far.target)
+    assert far.chosen.seconds(far.target) <= max(of(far, "explicit").seconds(far.target), planner.INSTANT)
     assert str(far.chosen.candidate) in far.why[0] and "R" in far.why[1] and far.why[2].startswith("runner-up")
     assert far.spent > 0.0 and far.clock > 0.0 and not far.fewer_far
     told = report.facts(far)
@@ -234,6 +234,26 @@ def test_without_a_stop_it_is_done_at_the_target(far: Plan, monkeypatch: pytest.
     choice = shot.chosen(far.scene)
     assert (choice.spp, choice.seconds) == (None, None) and choice.target_error is not None
     assert math.hypot(choice.target_error, far.chosen.floor.value) == pytest.approx(far.target)
+
+
+def test_nobody_waits_for_days(far: Plan, ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the target takes longer than a patient user waits, the least error in that time is taken, and it ends then;
+    who asks for an error gets it, however long it takes; with samples per pixel their error is said."""
+    monkeypatch.setattr(planner, "SECONDS", 1.0)
+    monkeypatch.setattr(planner, "PATIENCE", 0.5)
+    scene = replace(far.scene, render=Render("auto"))
+    monkeypatch.setattr(shot, "TARGET", 0.002)
+    choice = shot.chosen(scene, threads=2)
+    assert (choice.spp, choice.seconds, choice.target_error) == (None, 0.5, None)
+    assert choice.plan is not None and "after 0.5 s (none is sure to meet 0.2 %" in choice.plan.why[0]
+    asked = shot.chosen(scene, target_error=0.002, threads=2)
+    assert asked.seconds is None and asked.target_error == 0.002
+    assert asked.plan is not None and asked.plan.seconds is None
+    counted = shot.chosen(scene, spp=4, threads=2)
+    assert counted.plan is not None
+    p = counted.plan.chosen
+    error = report.percent(math.hypot(p.floor.value, 0.5 * math.sqrt(p.variance)))
+    assert f"an error of {error} with 4 samples per pixel" in counted.plan.why[0]
 
 
 def test_pilots_render_what_is_taken(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:

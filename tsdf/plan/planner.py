@@ -48,7 +48,11 @@ EVENT_S = (1.0e-6, 5.0e-6)  # [s] of one explicit grain, an exact sphere and one
 MEETINGS = 400.0  # of lights that are met by chance alone, that a pilot is believed from on: its mean, and what others
 # differ from it by, is known to a twentieth then, and the error bar of that to as much
 LEAST_PER_E = 2.0  # explicit grains of facets that bring texture down by e, at least
-TIE = 1.1  # times as long as the cheapest as it may take, of those the one with the least error is taken
+TIE, INSTANT = (
+    1.1,
+    1.0,
+)  # times as long as the cheapest as it may take, or [s], of those the one with the least error is taken
+PATIENCE = 600.0  # [s] that a picture may take where nothing is said
 ALIKE = 0.2  # of the logarithm of an error, what two levels of teleportation may differ by
 BUSY = 1.5  # times as long as on processors that have nothing else to do, from which on it is said
 LEAST = 1e-4  # [1] of an error
@@ -85,8 +89,8 @@ def plan(
     target : float
         Error of the picture that is asked for, bias, texture and noise together, over its mean [1].
     seconds : float, optional
-        Time that the picture may take [s]: then it is the cheapest that meets the target within it, else the one with
-        the least error.
+        Time that the picture may take [s], `PATIENCE` by default, infinite for as long as it takes: it is the cheapest
+        that meets the target within it, else the one with the least error.
     spp : int, optional
         Samples per pixel that it will have instead: then it is the cheapest whose bias and texture alone are within the
         target, else that in which they are least.
@@ -103,8 +107,8 @@ def plan(
         In one line; a level that is impossible is a note instead, unless all are.
     """
     checked_target(target)
-    if seconds is not None and not 0.0 < seconds < math.inf:
-        raise UsageError(f"seconds are a finite number above 0, not {seconds:g}")
+    if seconds is not None and not seconds > 0.0:
+        raise UsageError(f"seconds are a number above 0, not {seconds:g}")
     if scene.render.explicit_grains:
         raise UsageError(f"{scene.name}: explicit_grains is what a plan chooses; leave it out, or name a level")
     run = _Planning(scene, target, seconds, scene.render.seed if seed is None else seed, threads or os.cpu_count() or 1)
@@ -117,7 +121,9 @@ class _Planning:
     """What is common to one plan, as far as it has come."""
 
     def __init__(self, scene: Scene, target: float, seconds: float | None, seed: int, threads: int) -> None:
-        self.asked, self.target, self.seconds, self.seed, self.threads = scene, target, seconds, seed, threads
+        self.asked, self.target, self.seed, self.threads = scene, target, seed, threads
+        self.limit = PATIENCE if seconds is None else seconds
+        self.said = seconds is not None and math.isfinite(seconds)  # whether that long is meant, and not at most
         self.told: Callable[[float, str], None] = lambda share, word: None
         self.scene, self.tables = loaded(scene)
         camera = self.scene.camera
@@ -132,7 +138,7 @@ class _Planning:
         self.footprint, self.coverage, self.ratio, self.far = math.inf, 0.0, 1.0, False  # see `prior.looks`
         self.chance = 0.0  # kurtosis of lights that single grains meet by chance
         self.notes: list[str] = []
-        self.budget = max(SECONDS, min(SHARE * (seconds or 0.0), MOST_SECONDS))
+        self.budget = max(SECONDS, min(SHARE * self.limit, MOST_SECONDS)) if self.said else SECONDS
         self.spp: int | None = None
         self.spent, self.load, self.began = 0.0, 1.0, time.perf_counter()
         self.places: dict[bool, Place] = {}
@@ -172,9 +178,13 @@ class _Planning:
         far = bool(chosen.candidate.explicit_grains) and self.far
         thin = all(medium.packing_fraction <= MOST_PACKED for medium in self.scene.media)
         lacking = needs.of_tables(self.named, self.target, chosen.candidate.level, thin)
+        beyond = self.spp is None and math.isfinite(self.limit) and not (
+            chosen.seconds(self.target) <= self.limit / self.load
+        )  # fmt: skip
         made = Plan(
-            self.asked, self.target, self.seconds, (chosen, *rest), far, (), tuple(lacking), tuple(self.notes),
-            self.spent, time.perf_counter() - self.began, self.threads, self.load,
+            self.asked, self.target, self.limit if self.said or beyond else None, (chosen, *rest), far, (),
+            tuple(lacking), tuple(self.notes), self.spent, time.perf_counter() - self.began, self.threads, self.load,
+            self.spp,
         )  # fmt: skip
         return replace(made, why=why(made, self.bodies, self.footprint, self.coverage, str(self.reference)))
 
@@ -510,12 +520,12 @@ class _Planning:
             return min(fit, key=lambda p: p.turn) if fit else min(found, key=lambda p: p.floor.high)
         best = min(found, key=lambda p: p.safe_seconds(self.target))
         takes = best.safe_seconds(self.target)
-        limit = math.inf if self.seconds is None else self.seconds / self.load
+        limit = self.limit / self.load
         if not takes <= limit and math.isfinite(limit):
             return min(found, key=lambda p: math.hypot(p.floor.high, p.noise(limit)))
         if math.isinf(takes):
             return min(found, key=lambda p: p.floor.high)
-        alike = [p for p in found if p.safe_seconds(self.target) <= TIE * takes]
+        alike = [p for p in found if p.safe_seconds(self.target) <= max(TIE * takes, min(INSTANT, limit))]
         return min(alike, key=lambda p: p.floor.high)
 
 

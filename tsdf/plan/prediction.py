@@ -69,7 +69,7 @@ class Plan:
     target : float
         Error that is asked for [1].
     seconds : float or None
-        Time that the picture may take [s].
+        Time that the picture takes [s], where it is not done at the target.
     predictions : tuple of Prediction
         The chosen first, then by the time to the target.
     fewer_far : bool
@@ -88,6 +88,8 @@ class Plan:
     threads : int
     load : float
         How many times as long things take now as they would if processors had nothing else to do.
+    spp : int or None
+        Samples per pixel that the picture has, where it is done then.
     """
 
     scene: Scene
@@ -102,6 +104,7 @@ class Plan:
     clock: float
     threads: int
     load: float = 1.0
+    spp: int | None = None
 
     @property
     def chosen(self) -> Prediction:

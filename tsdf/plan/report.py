@@ -10,6 +10,7 @@ from tsdf.plan.prediction import Plan, Prediction
 from tsdf.plan.prior import Body
 
 TARGETS = np.geomspace(0.002, 0.5, 120)  # [1] that are tried for what would change a plan's mind
+OTHER = 1.2  # times as high or low as its target, from which on another target is another wish
 
 
 def why(plan: Plan, bodies: Sequence[Body], footprint: float, coverage: float, reference: str) -> tuple[str, ...]:
@@ -39,6 +40,8 @@ def span(seconds: float) -> str:
     """Return a time as one reads it."""
     if math.isinf(seconds):
         return "no time"
+    if seconds < 0.01:
+        return "less than .01 s"
     if seconds < 100.0:
         return f"{seconds:.2g} s"
     for unit, size in (("min", 60.0), ("h", 3600.0)):
@@ -47,20 +50,32 @@ def span(seconds: float) -> str:
     return f"{seconds / 86400.0:.3g} days"
 
 
+def _about(seconds: float) -> str:
+    return span(seconds) if seconds < 0.01 else f"about {span(seconds)}"
+
+
 def _first(plan: Plan) -> str:
     p = plan.chosen
     far = ", fewer where a pixel covers more" if plan.fewer_far else ""
     takes = p.seconds(plan.target)
     if math.isinf(p.variance):
         return f"take {p.candidate}{far}: nothing is known of its noise"
-    if plan.seconds is not None and plan.able is not None and not takes <= plan.able:
+    if plan.spp is not None:
+        after = f"an error of {percent(math.hypot(p.floor.value, math.sqrt(p.variance / plan.spp)))}"
+        after += f" with {plan.spp} samples per pixel"
+        met = f"{percent(p.floor.value)} of it is not noise"
+    elif plan.seconds is not None and plan.able is not None:
         after = f"an error of {percent(p.error(plan.able))} after {span(plan.seconds)}"
         met = f"none is sure to meet {percent(plan.target)} in that time, and this one has least"
+        if takes <= plan.able:
+            met = f"{percent(plan.target)} after {_about(takes)}"
     elif math.isinf(takes):
         after, met = f"an error of {percent(p.floor.value)} at best", f"none is sure to meet {percent(plan.target)}"
     else:
-        after = f"an error of {percent(plan.target)} after about {span(takes)}"
+        after = f"an error of {percent(plan.target)} after {_about(takes)}"
         met = f"noise {percent(math.sqrt(max(plan.target**2 - p.floor.value**2, 0.0)))}"
+    if p.floor.error > p.floor.value > plan.target:
+        met += f"; {percent(p.floor.value)} ± {percent(p.floor.error)} of it is expected, not measured"
     return f"take {p.candidate}{far}: {after} ({met})"
 
 
@@ -71,7 +86,8 @@ def _reason(plan: Plan, bodies: Sequence[Body], footprint: float, coverage: floa
     body = max(bodies, key=lambda one: one.thickness)
     seen = f"a pixel covers {footprint:.2g} R" if math.isfinite(footprint) else "no grains are seen"
     deep = body.thickness / body.transport
-    where = f"{seen}, f = {body.packing_fraction:g}, {body.thickness:.2g} R or {deep:.2g} l* thick"
+    which = f"the thickest of {len(bodies)} media has " if len(bodies) > 1 else ""
+    where = f"{seen}, {which}f = {body.packing_fraction:g}, {body.thickness:.2g} R or {deep:.2g} l* thick"
     turn = chosen.variance * chosen.turn
     worse = [p for p in plan.predictions[1:] if p.variance * p.turn < turn and p.floor.high > 0.0]
     nearest = min(worse, key=lambda p: p.floor.value, default=None)
@@ -92,8 +108,8 @@ def _other(plan: Plan) -> str:
         best = min(plan.predictions, key=lambda p: p.safe_seconds(float(target)))
         if math.isfinite(best.safe_seconds(float(target))):
             flips[float(target)] = best
-    lower = [t for t, p in flips.items() if t < plan.target and p is not chosen]
-    upper = [t for t, p in flips.items() if t > plan.target and p is not chosen]
+    lower = [t for t, p in flips.items() if OTHER * t < plan.target and p is not chosen]
+    upper = [t for t, p in flips.items() if t > OTHER * plan.target and p is not chosen]
     changes = []
     if lower:
         changes.append(f"a target below {percent(max(lower))} ({flips[max(lower)].candidate})")

@@ -3,6 +3,7 @@
 Level "auto" is a plan: here it becomes a level, explicit grains before it, and when to stop.
 """
 
+import math
 import os
 import warnings
 from collections.abc import Callable, Mapping
@@ -39,7 +40,7 @@ def chosen(
     """Return a scene at a level, and when its picture is done; planned where the level is "auto".
 
     A stop that is given is obeyed, and the choice is for it; else the scene's samples per pixel are taken, and where it
-    says none, `SPP`, or of a plan, as many as make its error `TARGET`.
+    says none, `SPP`, or of a plan, as many as make its error `TARGET`, but no more than take `planner.PATIENCE`.
     """
     level = level or scene.render.level
     if spp is None and seconds is None and target_error is None:
@@ -47,9 +48,10 @@ def chosen(
     if level != AUTO:
         return Choice(replace(scene, render=replace(scene.render, level=level)), spp, seconds, target_error, None)
     target = TARGET if target_error is None else BOTH * target_error
-    made = plan(scene, min(target, 0.99), seconds, spp, seed, threads, told)
+    limit = math.inf if target_error is not None else seconds
+    made = plan(scene, min(target, 0.99), limit, spp, seed, threads, told)
     if spp is None and seconds is None and target_error is None:
-        target_error = made.noise
+        target_error, seconds = (made.noise, None) if made.seconds is None else (None, made.seconds)
     return Choice(made.planned, spp, seconds, target_error, made)
 
 
