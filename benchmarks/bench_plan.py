@@ -14,13 +14,15 @@ import os
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tsdf.picture import render, world
-from tsdf.plan.planner import plan
+from tsdf.plan import prior
+from tsdf.plan.planner import FEWER, plan
 from tsdf.plan.prediction import Plan
 from tsdf.scene.scene import Scene, parse
 from tsdf.study.candidates import Candidate, candidates, taken
@@ -162,6 +164,8 @@ def photographed(
 
 def measured(scene: Scene, truth_s: float, each_s: float, others: set[Candidate]) -> dict[Candidate, Measured]:
     places: dict[bool, Place] = {}
+    far = prior.looks(world.build(scene, "volume", leap=0.0, places=places))[2] > FEWER  # as plans have it
+    scene = replace(scene, render=replace(scene.render, fewer_far=far))
     truth, processor = photographed(scene, Candidate("explicit"), truth_s, 1, places)
     found = {Candidate("explicit"): Measured(truth, truth, processor)}
     found[Candidate("explicit")].square = 0.0

@@ -31,7 +31,12 @@ from tsdf.scene import scene
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [*ROOT.glob("*.md"), *ROOT.glob("*/*.md"), *ROOT.glob("reference_data/golden/*.md")]
-DOCUMENTS = sorted(path for path in DOCUMENTS if path.parts[-2][0] != "." and path.name != "CHANGELOG.md")
+MADE = {"stress", "frontier", "bench", "gallery", "demo", "reference"}  # folders of what make writes
+DOCUMENTS = sorted(
+    path
+    for path in DOCUMENTS
+    if path.parts[-2][0] != "." and path.parts[-2] not in MADE and path.name != "CHANGELOG.md"
+)
 LANGUAGES = {"", "python", "cpp", "glsl", "toml", "xml", "hex", "json"}
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 COMMANDS: dict[str, click.Command] = {

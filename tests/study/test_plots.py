@@ -100,7 +100,7 @@ def test_names_are_shown_literally(tables, tmp_path):
 
 
 def test_outputs_that_cannot_be(tables, tmp_path):
-    for name in ("a.svg", "a", "png"):
+    for name in ("a.gif", "a", "png"):
         with pytest.raises(UsageError, match="a picture is"):
             plots.check_suffix(tmp_path / name)
     figure = plots.plot_validation(tables["cube"])

@@ -188,5 +188,6 @@ def test_what_cannot_be_is_said(ball: Table) -> None:
 
 def test_a_sun_that_cannot_be_aimed_at_is_said(ball: Table) -> None:
     medium = MediumSpec(Slab(-4.0, 0.0), 0.5, 1.0, (GrainSpec(ball),))
-    notes = world.build(Scene(CAMERA, SKY, (medium,)), LEVEL).notes
-    assert any(f"level {LEVEL} meets suns" in note for note in notes)
+    for lights, small in (((SunLight((0.0, 0.0, 1.0), (1.0, 1.0, 1.0), 0.5),), True), (SKY, False)):
+        notes = world.build(Scene(CAMERA, lights, (medium,)), LEVEL).notes
+        assert any(f"level {LEVEL} meets suns" in note for note in notes) == small

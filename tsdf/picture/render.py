@@ -20,7 +20,7 @@ import numpy as np
 
 from tsdf.errors import SceneError, UsageError
 from tsdf.handle import Handle
-from tsdf.picture.trust import MOST_VOV, Moments, Trust, kurtosis_of
+from tsdf.picture.trust import SHOWN, Moments, Trust, kurtosis_of
 from tsdf.picture.world import World, camera_of, sees
 from tsdf.scene.levels import LEVELS
 from tsdf.walk import packed, transport
@@ -213,7 +213,7 @@ def render(
         Stop when another pass over all pixels would take longer than this; one is always made.
     target_error : float, optional
         Stop when `Picture.relative_error` is below this, and as many samples are taken as lights that are met by chance
-        alone need to show in it (`Trust.chance` not above `trust.MOST_VOV`).
+        alone need to show in it (`Trust.chance` not above `trust.SHOWN`).
     seed : int
         The same seed and number of samples give the same picture for any number of threads.
     threads : int, optional
@@ -469,7 +469,7 @@ class Goal:
         """Return the share done in [0, 1], with `found` samples per pixel of a pass after `done`, at this error and
         `Trust.chance`."""
         if self.target_error is not None and done > 1:
-            return min(1.0, (self.target_error / error) ** 2, MOST_VOV / max(chance, MOST_VOV))
+            return min(1.0, (self.target_error / error) ** 2, SHOWN / max(chance, SHOWN))
         if self.seconds is not None:
             return min(1.0, spent / self.seconds)
         return (done + found) / self.spp if self.spp else 0.0
@@ -477,9 +477,9 @@ class Goal:
     def reached(self, done: int, error: float, black: bool, chance: float = 0.0) -> bool:
         """Return whether an error is small enough after `done` samples per pixel, or never will be.
 
-        Neither is known before lights that are met by chance alone have been met about 1 / `MOST_VOV` times: until then
-        a picture looks free of noise for their light is missing from it.
+        Neither is known before lights that are met by chance alone have been met about 1 / `SHOWN` times: until then a
+        picture may look free of noise for their light is missing from it.
         """
-        if self.target_error is None or chance > MOST_VOV:
+        if self.target_error is None or chance > SHOWN:
             return False
         return (done > 1 and error <= self.target_error) or (done >= BLACK and black)

@@ -14,6 +14,7 @@ import numpy as np
 from tsdf.walk.lights import LUMINANCE, LightArrays
 
 MOST_VOV = 0.1  # [1] variance of the variance of a picture that is trusted; MCNP's
+SHOWN = 0.1 * MOST_VOV  # [1] `Trust.chance` below which lights show in the variance, though grains send less their way
 LEAST_SLOPE = 3.0  # of the density of samples: below, they have no variance; MCNP's
 IDLE_VOV = 0.01  # below, the largest samples make too little of the variance for their slope to matter
 LARGEST, RARE, FEWEST = 201, 20, 25  # samples that tell it: so many, of so many times as many at least; MCNP's most
