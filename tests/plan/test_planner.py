@@ -74,7 +74,7 @@ def test_a_dense_slab_seen_from_afar(far: Plan) -> None:
     assert of(far, "teleport").bias > 2.0 * of(far, "teleport").bias_error > 0.0
     assert of(far, "teleport").floor.value > of(far, "teleport-memory").floor.value
     assert far.chosen.floor.high < far.target and len(far.why) == 3
-    assert far.chosen.seconds(far.target) <= max(of(far, "explicit").seconds(far.target), planner.INSTANT)
+    assert far.chosen.seconds(far.target) <= of(far, "explicit").seconds(far.target)
     assert str(far.chosen.candidate) in far.why[0] and "R" in far.why[1] and far.why[2].startswith("runner-up")
     assert far.spent > 0.0 and far.clock > 0.0 and not far.fewer_far
     told = report.facts(far)

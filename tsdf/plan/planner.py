@@ -48,10 +48,7 @@ EVENT_S = (1.0e-6, 5.0e-6)  # [s] of one explicit grain, an exact sphere and one
 MEETINGS = 400.0  # of lights that are met by chance alone, that a pilot is believed from on: its mean, and what others
 # differ from it by, is known to a twentieth then, and the error bar of that to as much
 LEAST_PER_E = 2.0  # explicit grains of facets that bring texture down by e, at least
-TIE, INSTANT = (
-    1.1,
-    1.0,
-)  # times as long as the cheapest as it may take, or [s], of those the one with the least error is taken
+TIE = 1.1  # times as long as the cheapest as it may take, of those the one with the least error is taken
 PATIENCE = 600.0  # [s] that a picture may take where nothing is said
 ALIKE = 0.2  # of the logarithm of an error, what two levels of teleportation may differ by
 BUSY = 1.5  # times as long as on processors that have nothing else to do, from which on it is said
@@ -525,7 +522,7 @@ class _Planning:
             return min(found, key=lambda p: math.hypot(p.floor.high, p.noise(limit)))
         if math.isinf(takes):
             return min(found, key=lambda p: p.floor.high)
-        alike = [p for p in found if p.safe_seconds(self.target) <= max(TIE * takes, min(INSTANT, limit))]
+        alike = [p for p in found if p.safe_seconds(self.target) <= TIE * takes]
         return min(alike, key=lambda p: p.floor.high)
 
 
