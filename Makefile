@@ -14,8 +14,8 @@ help:  ## list the targets
 install: .venv/installed  ## make the virtual environment .venv with everything in it
 
 demo: .venv/installed  ## tables of two kinds, plotted and validated, and one small picture at two levels, into demo/
-	@echo "make demo: two tables and the published sphere (20 s), their plots and validation (20 s), glass beads grain by"
-	@echo "grain and by teleportation, kernels compiled first (60 s on two cores). make gallery has everything else."
+	@echo "make demo: two tables and the published sphere (15 s), their plots and validation (10 s), glass beads grain by"
+	@echo "grain and by teleportation, kernels compiled first (45 s on two cores). make gallery has everything else."
 	mkdir -p demo
 	$(BIN)/tsdf-build sphere --eta 1.5 --joint 32 --memory 64 --out demo/glass.tsdf.exr
 	$(BIN)/tsdf-build snow --paths 1e6 --out demo/grain.tsdf.exr
