@@ -20,6 +20,7 @@ from tsdf.scene.medium import Component, free_path
 from tsdf.stress import cells, naive, report, rows
 from tsdf.stress import own as own_rows
 from tsdf.stress.cells import FAILS, HOLDS, NAIVE, OURS, UNSURE, Measured, Row, Setting, verdict
+from tsdf.study.ranking import mean_of
 
 ROOT = Path(__file__).parents[2]
 # Rows that take next to nothing, and what is known to fail in them
@@ -125,11 +126,11 @@ def test_the_naive_slab_is_right_but_for_its_ends() -> None:
     h = [naive.h_function(1.0 - loss) for loss in (1e-4, 4e-4)]
     assert 2.0 * h[0] - h[1] == pytest.approx(2.9078, abs=5e-3)  # linear in the root of the loss
     fair = naive.isotropic_slab(40.0, 0.9, 100_000, np.random.default_rng(1), lambda event, weight, rng: weight)
-    value, error = cells.mean_of(fair.weight * fair.up)
+    value, error = mean_of(fair.weight * fair.up)
     truth = 1.0 - naive.h_function(0.9) * math.sqrt(0.1)
     assert abs(value - truth) < 4.0 * error < 0.03 * truth
     short = naive.isotropic_slab(40.0, 0.9, 100_000, np.random.default_rng(1), naive.ended)
-    assert cells.mean_of(short.weight * short.up)[0] < truth - 4.0 * error
+    assert mean_of(short.weight * short.up)[0] < truth - 4.0 * error
 
 
 def test_no_jump_passes_what_is_thicker_than_a_grain() -> None:

@@ -24,10 +24,9 @@ AT_ONCE = 1 << 15  # samples of a thread at once, at most
 
 
 class Seen(NamedTuple):
-    """What a pilot saw; numbers are over its mean, with standard errors, and infinite where that is black."""
+    """What a pilot saw; its variance is infinite where that is black."""
 
     mean: float  # radiance
-    mean_error: float  # over it [1]
     variance: float  # of one sample of a pixel, the mean of all pixels, over the mean squared [1]
     seconds: float  # of one thread, a sample [s]
     events: float  # grains met by a sample
@@ -122,10 +121,10 @@ class Pilot:
         events, each = sum(int(one.counters[0]) for one in self._walkers), self.timed / max(self.timed_samples, 1)
         met = events / max(count * n, 1)
         if not mean > 0.0:
-            return Seen(0.0, math.inf, math.inf, each, met, count * n)
+            return Seen(0.0, math.inf, each, met, count * n)
         variance = np.maximum(squares / count - (total / count) ** 2, 0.0) * count / max(count - 1, 1)
         grey = float(variance.mean())
-        return Seen(mean, math.sqrt(grey / (count * n)) / mean, grey / mean / mean, each, met, count * n)
+        return Seen(mean, grey / mean / mean, each, met, count * n)
 
     def pixel_means(self, half: int) -> np.ndarray:
         """Mean radiance of each pixel (n, 3) in one half."""

@@ -168,11 +168,6 @@ def known_to(method: str, truth: tuple[float, float]) -> Measured:
     return Measured(method, 0.0, 100.0 * abs(truth[1] / truth[0]), f"{truth[0]:.5g}", truth=True)
 
 
-def mean_of(values: np.ndarray) -> tuple[float, float]:
-    """Return the mean of numbers (n,) and its standard error."""
-    return float(values.mean()), float(values.std(ddof=1) / math.sqrt(len(values)))
-
-
 @dataclass(eq=False)
 class Setting:
     """What rows are measured with: how much, and the tables that they share.

@@ -26,10 +26,10 @@ from tsdf.stress.cells import (
     Setting,
     attempted,
     known_to,
-    mean_of,
     relative,
 )
 from tsdf.study.experiment import Ends, follow, gather, scene_of, slab_experiment
+from tsdf.study.ranking import mean_of
 
 GROUP = "Ends of paths"
 F = 0.6

@@ -14,8 +14,9 @@ from tsdf.make import tally as T
 from tsdf.make.effort import MAX_PATHS
 from tsdf.make.tally import Tally
 from tsdf.make.tracer import Tracer, in_order
-from tsdf.stress.cells import TABLES, Measured, Row, Setting, mean_of, share
+from tsdf.stress.cells import TABLES, Measured, Row, Setting, share
 from tsdf.stress.rays import turn_of_records
+from tsdf.study.ranking import mean_of
 
 GROUP = "Tables and random numbers"
 DEPENDS = "rendering.md, Levels"

@@ -14,7 +14,8 @@ from tsdf.judge import analytic
 from tsdf.make import tally as T
 from tsdf.make.tally import Tally
 from tsdf.make.tracer import MAX_BOUNCES, Tracer, in_order
-from tsdf.stress.cells import REFUSED, TABLES, TRACER, Measured, Row, Setting, mean_of, relative, share
+from tsdf.stress.cells import REFUSED, TABLES, TRACER, Measured, Row, Setting, relative, share
+from tsdf.study.ranking import mean_of
 
 GROUP = "Rays at surfaces, light in one grain"
 ALONG, FIXED = 1e-6, 1e-4
