@@ -50,7 +50,7 @@ def ball(subdivisions: int = 2, radius: float = 1.0) -> np.ndarray:
 def made(*meshes: np.ndarray, cells: int = 3000, half: float = 1.1) -> Grid:
     planes = planes_of(np.concatenate(meshes))
     box = np.full(3, -half), np.full(3, half)
-    return grid_of(meshes, planes, np.full(len(planes), THICK), box, cells, 0.0, False)
+    return grid_of(meshes, np.full(len(meshes), -1, np.int32), planes, np.full(len(planes), THICK), box, cells, 0.0, False)
 
 
 def floor(z: float, size: float) -> np.ndarray:

@@ -22,7 +22,7 @@ from tsdf.grain.meshes import read_mesh
 from tsdf.scene.keys import FARTHEST
 from tsdf.scene.scene import SMALLEST, Box, MediumSpec, Mesh, Rectangle, Scene, Slab, Sphere, SurfaceSpec, called
 from tsdf.vectors import KERNEL, dot, step
-from tsdf.walk.grid import GRAZING, Grid, free_around, grid_of, march
+from tsdf.walk.grid import GRAZING, NONE, Grid, free_around, grid_of, march
 from tsdf.walk.room import BALL, BOX, CLOSED, MESH, OPEN, SLAB, Room, exact_depth, room_of
 
 SLACK = 2e-6  # [of a facet's largest coordinate] a point this near to a facet is on it: 30 float32 ulps
@@ -30,8 +30,8 @@ GRID_CELLS = 2_000_000  # of the grid of facets: half a second to make
 RANGE = 1e6  # of the largest coordinate to the smallest extent of a medium, which a facet that large blurs
 DIGITS = 1e-9  # of a coordinate is the least size there
 LEAST_OVERLAP = 1e-3  # [of the smaller extent] media that overlap by less only touch
+ROUNDING = 1e-13  # of coordinates: what leans outward by less is flat
 NEAR = 1e-4  # of a way or a ball's radius: what passes a ball so near is looked at with more care
-NONE = -1
 
 
 class Geometry(NamedTuple):
@@ -40,7 +40,7 @@ class Geometry(NamedTuple):
     kind (m,), shape (m, 6), slack (m,), engine (m,) of media: kind, numbers, thickness of an exact boundary [unit],
     ray-engine scene; grid: facets by cells, in which their meshes are the ray-engine scenes; surface (f,) of facets;
     balls (b, 4), ball_surface (b,): centre, radius, surface; reflectance (s, 3); engines: the number of ray-engine
-    scenes; solid: the first of them is that of the surfaces.
+    scenes; solid: the first of them is that of the surfaces; convex: there is nothing but one medium, in a convex mesh.
     """
 
     kind: np.ndarray
@@ -54,6 +54,7 @@ class Geometry(NamedTuple):
     reflectance: np.ndarray
     engines: int
     solid: bool
+    convex: bool
 
 
 # ------------------------------------------------------------------------------------------- for kernels
@@ -337,13 +338,14 @@ def place(scene: Scene, grains: bool = False) -> Place:
         shape=shape,
         slack=slack,
         engine=engine,
-        grid=_grid(meshes, low - centre, high - centre, scene),
+        grid=_grid(meshes, engine, low - centre, high - centre, scene),
         surface=owners,
         balls=places,
         ball_surface=np.array([i for i, _ in balls], np.int32),
         reflectance=np.array([s.reflectance for s in scene.surfaces], np.float64).reshape(-1, 3),
         engines=len(engines),
         solid=solid,
+        convex=len(meshes) == len(scene.media) == 1 and not solid and not balls and is_convex(meshes[0]),
     )
     made = Place(arrays, engines, first_facet, centre, boundaries, surfaces, room, notes)
     _no_overlap(made, scene, grains)
@@ -400,6 +402,30 @@ def _exact_shapes(media: Sequence[MediumSpec], centre: np.ndarray) -> tuple[np.n
             kind[i], shape[i, :3], shape[i, 3] = BALL, s.centre - centre, s.radius
         slack[i] = 1e-9 * max(np.abs(shape[i]).max(), medium.radius)
     return kind, shape, slack
+
+
+def is_convex(mesh: Triangles) -> bool:
+    """Return whether a closed mesh without self-intersections is convex: one piece whose facets all lean inward.
+
+    What is convex along each edge is convex in whole (Tietze 1928, Nakajima 1928).
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    faces = np.asarray(mesh.faces, np.int64)
+    one = np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)])
+    facet, opposite = np.tile(np.arange(len(faces)), 3), np.concatenate([faces[:, (k + 2) % 3] for k in range(3)])
+    size = len(mesh.vertices)
+    here, there = one[:, 0] * size + one[:, 1], one[:, 1] * size + one[:, 0]
+    order, back = np.argsort(here), np.argsort(there)
+    if not np.array_equal(here[order], there[back]) or (np.diff(here[order]) == 0).any():
+        return False  # more than two facets meet at an edge
+    planes = planes_of(mesh.vertices[faces])[facet[order]]
+    height = np.einsum("ij,ij->i", planes[:, :3], mesh.vertices[opposite[back]]) - planes[:, 3]
+    if (height > ROUNDING * np.abs(mesh.vertices).max()).any():
+        return False
+    pairs = coo_array((np.ones(len(order), bool), (facet[order], facet[back])), shape=(len(faces), len(faces)))
+    return int(connected_components(pairs, directed=False)[0]) == 1
 
 
 def _ray_meshes(
@@ -512,8 +538,9 @@ def planes_of(corners: np.ndarray) -> np.ndarray:
     return np.column_stack((normals, np.einsum("ij,ij->i", normals, corners.mean(axis=1))))
 
 
-def _grid(meshes: Sequence[Triangles], low: np.ndarray, high: np.ndarray, scene: Scene) -> Grid:
-    """Return the grid over all media, which lie wholly inside it; where one is endless, over all facets."""
+def _grid(meshes: Sequence[Triangles], engine: np.ndarray, low: np.ndarray, high: np.ndarray, scene: Scene) -> Grid:
+    """Return the grid over all media, which lie wholly inside it; where one is endless, over all facets. `engine` has
+    the number of each one's mesh."""
     endless = any(isinstance(medium.shape, Slab) for medium in scene.media)
     if endless:
         nothing = np.full(3, math.inf)
@@ -521,7 +548,9 @@ def _grid(meshes: Sequence[Triangles], low: np.ndarray, high: np.ndarray, scene:
     corners = [mesh.vertices[mesh.faces] for mesh in meshes]
     planes, thickness = _planes(meshes)
     least = 0.5 * min((medium.radius for medium in scene.media), default=0.0)  # smaller ones are more to go through
-    return grid_of(corners, planes, thickness, (low, high), GRID_CELLS if scene.media else 0, least, endless)
+    owner = np.full(len(meshes), NONE, np.int32)
+    owner[engine[engine != NONE]] = np.flatnonzero(engine != NONE)
+    return grid_of(corners, owner, planes, thickness, (low, high), GRID_CELLS if scene.media else 0, least, endless)
 
 
 def _no_overlap(made: Place, scene: Scene, single: bool) -> None:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tsdf.compiled import njit
+from tsdf.handle import Handle
 from tsdf.vectors import KERNEL, dot
 
 STEPS = 64  # of a ray through the grid; the ray engine is faster with those that need more
@@ -22,31 +23,42 @@ MOST_LISTED = 2e7  # facets in all cells, about: cells of very many large facets
 BATCH = 1 << 17  # triangles and boxes that are looked at together
 PAD = 0.004  # [cells] facets count as in a cell when this near to it, far more than the rounding of the way through
 GRAZING = 100.0  # times its thickness is the most that a point is moved off a facet along a ray
-NONE = -1
+FEW = 3  # facets in a cell, below which nothing is gained by looking whether they all are on one side
+ROUNDING = 1e-13  # of coordinates: some hundreds of the last bits of heights
+NEAR = 1e-7  # [cells] that near to a facet, on which side of it a place is is not asked
+NONE, UNKNOWN = -1, -2
 
 
 class Grid(NamedTuple):
     """What kernels ask about a grid of cells (x, y, z) over meshes' facets (f,).
 
     low (3,), edge: its corner and the edge of a cell; free (x, y, z) float32: distances of the cells' middles to the
-    nearest facet, at most; first (x y z + 1,) int32, listed: the facets in each cell, one cell after the other; outer:
+    nearest facet, at most; rings (x y z,) int8: to how many cells from each, it counted, there are no facets, but
+    for its own, 1 at least; first (x y z + 1,) int32, listed: the facets in each cell, one cell after the other; home
+    (x y z,) int16: the medium in whose mesh a place near each cell's middle is, see `mark`, NONE or UNKNOWN, none of it
+    where no medium has one; outer:
     the facets that reach out of the grid, if there are no more than OUTSIDE; closed: rays that leave the grid meet
     nothing else; beyond: distances outside it are at least those to the grid. corners (f, 3, 3); planes (f, 4): normal
-    and height over the origin; mesh (f,) int32: the number of the facet's mesh; thickness (f,): how near to it counts
-    as on it; margin: how far behind each other rays may meet facets, wholly inside the grid, that are at one place.
+    and height over the origin; mesh (f,) int32: the number of the facet's mesh; owner (meshes,) int32: the medium whose
+    boundary it is, NONE for surfaces; thickness (f,): how near to it counts as on it; margin: how far behind each other
+    rays may meet facets, wholly inside the grid, that are at one place.
     """
 
     low: np.ndarray
     edge: float
     free: np.ndarray
+    cells: np.ndarray
+    slabs: np.ndarray
     first: np.ndarray
     listed: np.ndarray
+    home: np.ndarray
     outer: np.ndarray
     closed: bool
     beyond: bool
     corners: np.ndarray
     planes: np.ndarray
     mesh: np.ndarray
+    owner: np.ndarray
     thickness: np.ndarray
     margin: float
 
@@ -122,8 +134,8 @@ def free_around(grid, p):
         wall = h * (0.5 - max(max(abs(x), abs(y)), abs(z)))
         if bound < wall:
             # Nearer than the walls of the cell there are only its own, none nearer than its plane
-            cell = (i * ny + j) * nz + k
-            for at in range(grid.first[cell], grid.first[cell + 1]):
+            what = int(grid.cells[(i * ny + j) * nz + k])
+            for at in range(grid.first[what] if what >= 0 else 0, grid.first[what + 1] if what >= 0 else 0):
                 f = grid.listed[at]
                 n = (grid.planes[f, 0], grid.planes[f, 1], grid.planes[f, 2])
                 wall = min(wall, abs(dot(n, p) - grid.planes[f, 3]))
@@ -174,9 +186,12 @@ def march(grid, met, p, d, end):
         i, j, k = int(x), int(y), int(z)
         if 0.0 <= x + end * dx - i < 1.0 and 0.0 <= y + end * dy - j < 1.0 and 0.0 <= z + end * dz - k < 1.0:
             # Short ways mostly end in the cell in which they begin
-            cell = (i * ny + j) * nz + k
-            for at in range(grid.first[cell], grid.first[cell + 1]):
-                end = min(end, compared(grid, met, grid.listed[at], p, d, line, end) + grid.margin)
+            what = int(grid.cells[(i * ny + j) * nz + k])
+            if what >= 0:
+                here, there = grid.first[what], grid.first[what + 1]
+                if there - here < FEW or not beside(grid, what, p, d, 0.0, end):
+                    for at in range(here, there):
+                        end = min(end, compared(grid, met, grid.listed[at], p, d, line, end) + grid.margin)
             return True
     # The ray enters the grid at t and leaves it at `last`
     t, last = 0.0, math.inf
@@ -189,32 +204,181 @@ def march(grid, met, p, d, end):
     t, last = max(t, min(a, b)), min(last, max(a, b))
     if not grid.closed and (nx == 0 or t > 0.0 or last < end):
         return False
+    last -= 1e-8 * h + 1e-13 * last  # not beyond it by rounding
+    i, j, k = (
+        min(max(int(x + t * dx), 0), nx - 1), min(max(int(y + t * dy), 0), ny - 1), min(max(int(z + t * dz), 0), nz - 1)
+    )  # fmt: skip
+    cell = (i * ny + j) * nz + k
+    # Where it leaves its cell along each axis, what lies between two such places, and which cell is the next
+    tx, ty, tz = ((i + (dx >= 0.0)) - x) * ix, ((j + (dy >= 0.0)) - y) * iy, ((k + (dz >= 0.0)) - z) * iz
+    nextx, nexty, nextz = (ny * nz if dx >= 0.0 else -ny * nz), (nz if dy >= 0.0 else -nz), (1 if dz >= 0.0 else -1)
+    ix, iy, iz, dx, dy, dz = abs(ix), abs(iy), abs(iz), abs(dx), abs(dy), abs(dz)
     for _ in range(STEPS):
         if not t <= min(last, end):
             return True
-        ux, uy, uz = x + t * dx, y + t * dy, z + t * dz
-        i, j, k = min(max(int(ux), 0), nx - 1), min(max(int(uy), 0), ny - 1), min(max(int(uz), 0), nz - 1)
-        cell = (i * ny + j) * nz + k
-        here, there = grid.first[cell], grid.first[cell + 1]
-        if here == there:
-            ux, uy, uz = ux - i - 0.5, uy - j - 0.5, uz - k - 0.5
-            free = grid.free[i, j, k] - h * math.sqrt(ux * ux + uy * uy + uz * uz)
-            if free > h:
-                t += free
-                continue
-        for at in range(here, there):
-            end = min(end, compared(grid, met, grid.listed[at], p, d, line, end) + grid.margin)
-        a = (i + (1.0 if dx >= 0.0 else 0.0) - x) * ix
-        b = (j + (1.0 if dy >= 0.0 else 0.0) - y) * iy
-        c = (k + (1.0 if dz >= 0.0 else 0.0) - z) * iz
-        t = max(t, min(a, min(b, c))) + 1e-6 * h
+        if not 0 <= cell < grid.cells.shape[0]:
+            return False
+        what = int(grid.cells[cell])
+        if what >= 0:
+            leaves = min(tx, min(ty, tz))
+            here, there = grid.first[what], grid.first[what + 1]
+            if there - here < FEW or not beside(grid, what, p, d, t, min(leaves, end)):
+                for at in range(here, there):
+                    end = min(end, compared(grid, met, grid.listed[at], p, d, line, end) + grid.margin)
+        if what >= -1:
+            if tx <= ty and tx <= tz:
+                t = tx
+                tx += ix
+                cell += nextx
+            elif ty <= tz:
+                t = ty
+                ty += iy
+                cell += nexty
+            else:
+                t = tz
+                tz += iz
+                cell += nextz
+            continue
+        far = -what - 1
+        t = min(tx + far * ix, min(ty + far * iy, tz + far * iz))
+        if tx <= t:
+            n = 1 + int((t - tx) * dx + 1e-9)
+            tx += n * ix
+            cell += n * nextx
+        if ty <= t:
+            n = 1 + int((t - ty) * dy + 1e-9)
+            ty += n * iy
+            cell += n * nexty
+        if tz <= t:
+            n = 1 + int((t - tz) * dz + 1e-9)
+            tz += n * iz
+            cell += n * nextz
     return False
+
+
+@njit(forceinline=True, **KERNEL)
+def beside(grid, what, p, d, t, end):
+    """Return whether a ray is on one side of all facets in an occupied cell between two places, both in it."""
+    n = (grid.slabs[what, 0], grid.slabs[what, 1], grid.slabs[what, 2])
+    at, by = dot(n, p), dot(n, d)
+    a, b = at + t * by, at + end * by
+    return min(a, b) > grid.slabs[what, 4] or max(a, b) < grid.slabs[what, 3]
+
+
+@njit(forceinline=True, **KERNEL)
+def mark(grid, i, j, k):
+    """Return the place of a cell whose medium is known: near its middle, but not where modelled facets often are."""
+    h = grid.edge
+    return grid.low[0] + (i + 0.517) * h, grid.low[1] + (j + 0.529) * h, grid.low[2] + (k + 0.541) * h
+
+
+@njit(**KERNEL)
+def height(grid, facet, p):
+    """Return how high p is over a facet's plane."""
+    return dot((grid.planes[facet, 0], grid.planes[facet, 1], grid.planes[facet, 2]), p) - grid.planes[facet, 3]
+
+
+@njit(**KERNEL)
+def crossings(grid, sums, cell, line, p, q):
+    """Add to `sums` (meshes,) how often the facets in a cell are crossed from p to q, both in it, on that line: inward
+    less outward."""
+    what = int(grid.cells[cell])
+    if what < 0:
+        return
+    for at in range(grid.first[what], grid.first[what + 1]):
+        facet = grid.listed[at]
+        over = height(grid, facet, p) > 0.0
+        if over != (height(grid, facet, q) > 0.0) and passes(grid.corners, facet, line):
+            sums[grid.mesh[facet]] += 1 if over else -1
+
+
+@njit(**KERNEL)
+def entered(grid, sums, home):
+    """Return the medium that holds a place, after so many crossings (meshes,) from a place that one holds; the first,
+    should there be more."""
+    for e in range(sums.shape[0]):
+        m = grid.owner[e]
+        if m != NONE and sums[e] + (1 if m == home else 0) > 0:
+            return m
+    return NONE
+
+
+@njit(**KERNEL)
+def home_of(grid, sums, p):
+    """Return the medium within whose mesh p is, NONE, or UNKNOWN where that is not known; `sums` (meshes,) is used."""
+    nx, ny, nz = grid.free.shape
+    if grid.home.shape[0] == 0:
+        return NONE
+    by = 1.0 / grid.edge
+    x, y, z = (p[0] - grid.low[0]) * by, (p[1] - grid.low[1]) * by, (p[2] - grid.low[2]) * by
+    if not (0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz):
+        return NONE
+    i, j, k = int(x), int(y), int(z)
+    cell = (i * ny + j) * nz + k
+    home = int(grid.home[cell])
+    if home == UNKNOWN or grid.cells[cell] < 0:
+        return home
+    for e in range(sums.shape[0]):
+        sums[e] = 0
+    q = mark(grid, i, j, k)
+    crossings(grid, sums, cell, line_of(q, (p[0] - q[0], p[1] - q[1], p[2] - q[2])), q, p)
+    return entered(grid, sums, home)
 
 
 # --------------------------------------------------------------------------------------------- from meshes
 
 
-def grid_of(meshes: Sequence[np.ndarray], planes: np.ndarray, thickness: np.ndarray,
+@njit(cache=True)
+def find_slabs(corners, planes, first, listed, slabs):
+    """Write to `slabs` (occupied, 5) a mean normal of the facets in each cell, and between which heights they are."""
+    for what in range(len(slabs)):
+        x = y = z = 0.0
+        for at in range(first[what], first[what + 1]):
+            f = listed[at]
+            x, y, z = x + planes[f, 0], y + planes[f, 1], z + planes[f, 2]
+        low, high, size = math.inf, -math.inf, 0.0
+        for at in range(first[what], first[what + 1]):
+            for k in range(3):
+                p = (corners[listed[at], k, 0], corners[listed[at], k, 1], corners[listed[at], k, 2])
+                up = dot((x, y, z), p)
+                low, high, size = min(low, up), max(high, up), max(size, abs(p[0]) + abs(p[1]) + abs(p[2]))
+        off = ROUNDING * size * (abs(x) + abs(y) + abs(z))
+        slabs[what, 0], slabs[what, 1], slabs[what, 2], slabs[what, 3], slabs[what, 4] = x, y, z, low - off, high + off
+
+
+@njit(cache=True)
+def find_homes(grid, home, sums):
+    """Write the medium of each cell's mark to `home` (x y z,): NONE at the grid's walls, and then as facets are
+    crossed along x; `sums` (meshes,) is used. UNKNOWN where rounding could matter."""
+    nx, ny, nz = grid.free.shape
+    way = (1.0, 0.0, 0.0)
+    for j in range(ny):
+        for k in range(nz):
+            now, before = NONE, mark(grid, 0, j, k)
+            line = line_of(before, way)
+            for i in range(nx):
+                cell, here = (i * ny + j) * nz + k, mark(grid, i, j, k)
+                last = ((i - 1) * ny + j) * nz + k if i > 0 else cell
+                if grid.cells[cell] >= 0 or grid.cells[last] >= 0:
+                    wall = (grid.low[0] + i * grid.edge, here[1], here[2])
+                    for e in range(sums.shape[0]):
+                        sums[e] = 0
+                    crossings(grid, sums, last, line, before, wall)
+                    crossings(grid, sums, cell, line, wall, here)
+                    now = entered(grid, sums, now)
+                home[cell], before = now, here
+            if now != NONE:  # these are no closed meshes
+                for i in range(nx):
+                    home[(i * ny + j) * nz + k] = UNKNOWN
+            for i in range(nx):
+                cell, here = (i * ny + j) * nz + k, mark(grid, i, j, k)
+                what = int(grid.cells[cell])
+                for at in range(grid.first[what] if what >= 0 else 0, grid.first[what + 1] if what >= 0 else 0):
+                    if abs(height(grid, grid.listed[at], here)) < NEAR * grid.edge:
+                        home[cell] = UNKNOWN
+
+
+def grid_of(meshes: Sequence[np.ndarray], owner: np.ndarray, planes: np.ndarray, thickness: np.ndarray,
             box: tuple[np.ndarray, np.ndarray], cells: int, least: float, beyond: bool) -> Grid:  # fmt: skip
     """Return the grid over a box.
 
@@ -222,6 +386,8 @@ def grid_of(meshes: Sequence[np.ndarray], planes: np.ndarray, thickness: np.ndar
     ----------
     meshes : sequence of (f, 3, 3) float64
         Corners of the facets of each mesh.
+    owner : (meshes,) int32
+        The medium that it is the boundary of, all of it in the box, NONE for surfaces.
     planes : (all f, 4) float64
         Unit normal, and height over the origin, of each facet.
     thickness : (all f,) float64
@@ -240,8 +406,9 @@ def grid_of(meshes: Sequence[np.ndarray], planes: np.ndarray, thickness: np.ndar
     low, high = box
     if not len(corners) or not cells:
         nothing = np.zeros(0, np.int32)
-        return Grid(np.zeros(3), 1.0, np.zeros((0, 0, 0), np.float32), np.zeros(1, np.int32), nothing, nothing,
-                    not len(corners), not len(corners), corners, planes, mesh, thickness, 0.0)  # fmt: skip
+        return Grid(np.zeros(3), 1.0, np.zeros((0, 0, 0), np.float32), nothing, np.zeros((0, 5)), np.zeros(1, np.int32),
+                    nothing, np.zeros(0, np.int16), nothing, not len(corners), not len(corners), corners, planes, mesh,
+                    owner, thickness, 0.0)  # fmt: skip
     size = np.maximum(high - low, 1e-3 * (high - low).max())
     sides = np.sort(np.clip(corners.max(axis=1), low, high) - np.clip(corners.min(axis=1), low, high), axis=1)
     area = float((sides[:, 1] * sides[:, 2]).sum())  # of the facets in the box, at most twice as much
@@ -252,8 +419,18 @@ def grid_of(meshes: Sequence[np.ndarray], planes: np.ndarray, thickness: np.ndar
     outer = ((corners < low + edge) | (corners > low + (counts - 1) * edge)).any(axis=(1, 2))
     margin = 2.0 * GRAZING * float(thickness[~outer].max(initial=0.0))
     few = int(outer.sum()) <= OUTSIDE
-    return Grid(low, edge, free, first, listed, outer.nonzero()[0].astype(np.int32)[: OUTSIDE * few], few, beyond,
-                corners, planes, mesh, thickness, margin)  # fmt: skip
+    home = np.full(free.size if (owner != NONE).any() else 0, NONE, np.int16)
+    occupied = np.flatnonzero(first[1:] > first[:-1])
+    number = _rings(first, counts)
+    number[occupied] = np.arange(len(occupied))
+    first = first[np.append(occupied, len(first) - 1)]
+    slabs = np.zeros((len(occupied), 5))
+    find_slabs(corners, planes, first, listed, slabs)
+    grid = Grid(low, edge, free, number, slabs, first, listed, home, outer.nonzero()[0].astype(np.int32)[: OUTSIDE * few], few,
+                beyond, corners, planes, mesh, owner, thickness, margin)  # fmt: skip
+    if home.size:
+        find_homes(Handle(grid), grid.home, np.zeros(len(owner), np.int32))
+    return grid
 
 
 def meets(corners: np.ndarray, planes: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -276,6 +453,16 @@ def meets(corners: np.ndarray, planes: np.ndarray, low: np.ndarray, high: np.nda
             inner += along * (np.where(along > 0.0, high[:, b], low[:, b]) - one[:, b])
             met &= inner >= 0.0
     return met
+
+
+def _rings(first: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return the parts of `Grid.cells` that are empty."""
+    from scipy.ndimage import distance_transform_cdt
+
+    empty = (first[1:] == first[:-1]).reshape(tuple(counts))
+    if empty.all():
+        return np.full(empty.size, -int(counts.max()), np.int32)
+    return -distance_transform_cdt(empty, "chessboard").astype(np.int32).ravel()
 
 
 def _batches(*arrays: np.ndarray) -> list[tuple[np.ndarray, ...]]:

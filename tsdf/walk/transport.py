@@ -34,7 +34,7 @@ from tsdf.vectors import KERNEL, cross, dot, frame, minus, renewed, step, triple
 from tsdf.walk import explicit as X
 from tsdf.walk import memory as M
 from tsdf.walk.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit, unmet
-from tsdf.walk.grid import GRAZING, march, plane_hit
+from tsdf.walk.grid import GRAZING, home_of, march, plane_hit
 from tsdf.walk.hybrid import hand_over
 from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, Leaps, leap, missing, patience
 from tsdf.walk.lights import LightArrays
@@ -581,7 +581,7 @@ def land(world, batch, w, amounts):
             move = -min(move, 0.5 * t_b)
         write(w.p, step(p, t_b + move, e))
         w.medium = UNKNOWN
-        if inside and outward > 0.0 and alone(g, m):
+        if inside and outward > 0.0 and (g.convex or alone(g, m)):
             return escape(world, batch, w, amounts)
     else:
         write(w.p, step(p, w.length, e))
@@ -626,10 +626,15 @@ def fly(world, batch, w, amounts):
         if w.events >= media.limit:
             batch.counters[TRUNCATED] += 1
             return ENDED
-        if alone(g, 0):
-            if home != NONE:
+        if home != NONE:
+            if g.convex or alone(g, 0):
                 return escape(world, batch, w, amounts)
+        elif alone(g, 0):
             w.medium = 0
+        elif g.engines > 0:  # it enters a medium, but that it may have met a corner
+            home = home_of(g.grid, hits[hits.shape[0] - 1], triple(w.p))
+            if home != NONE:
+                w.medium = home
         return LOOK
     return escape(world, batch, w, amounts)
 
