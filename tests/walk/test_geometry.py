@@ -12,6 +12,7 @@ from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
 from tsdf.make import scatterometer
 from tsdf.make.scatterometer import Effort
+from tsdf.picture import render, world
 from tsdf.scene.scene import Box, Camera, ConstantLight, GrainSpec, MediumSpec, Mesh, Scene, Slab, Sphere, SurfaceSpec
 from tsdf.walk import geometry
 from tsdf.walk.geometry import clearance, exact_hit, unmet
@@ -227,3 +228,44 @@ def test_open_boundary_is_refused(tmp_path, bumpy, table):
     with pytest.raises(SceneError, match=r"\[\[medium\]\] 1 \(m0\).*open\.ply") as error:
         placed(table, Mesh(tmp_path / "open.ply"))
     assert "\n" not in str(error.value)
+
+
+def test_which_meshes_are_convex(bumpy):
+    """Balls, boxes with facets in one plane, and the same with one corner pushed in, dents, and two pieces of one."""
+    grain = load_grain("icosphere", subdivisions=3)
+    convex, box = geometry.Triangles(grain.vertices, grain.faces), geometry.box_mesh((-1.0, -2.0, 0.1), (1.0, 3.0, 0.7))
+    assert geometry.is_convex(convex) and geometry.is_convex(box)
+    turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
+    turned = geometry.Triangles(box.vertices @ (turn * np.sign(np.linalg.det(turn))), box.faces)
+    assert geometry.is_convex(turned)  # rounding alone
+    dented = convex.vertices.copy()
+    dented[7] *= 0.97
+    assert not geometry.is_convex(geometry.Triangles(dented, convex.faces))
+    two = np.concatenate((convex.vertices, convex.vertices + 5.0))
+    assert not geometry.is_convex(geometry.Triangles(two, np.concatenate((convex.faces, convex.faces + 642))))
+    assert not geometry.is_convex(geometry.Triangles(convex.vertices, convex.faces[1:]))
+
+
+def test_who_leaves_a_lone_convex_mesh_asks_no_more(tmp_path, table):
+    """The ray engine is asked for what the camera sees and hardly more, the furnace is 1; where there is a surface, or
+    a dent, it is asked as it must be."""
+    convex, dented = load_grain("icosphere", subdivisions=3), load_grain("icosphere", subdivisions=3).vertices.copy()
+    dented[0] *= 0.6
+    asked = {}
+    floor = SurfaceSpec(Box((-9.0, -9.0, -2.0), (9.0, 9.0, -1.5)), (1.0, 1.0, 1.0))
+    for name, points, surfaces in (
+        ("convex", convex.vertices, ()),
+        ("dented", dented, ()),
+        ("floor", dented, (floor,)),
+    ):
+        lines = [f"v {x:.17g} {y:.17g} {z:.17g}" for x, y, z in points]
+        lines += [f"f {i} {j} {k}" for i, j, k in convex.faces + 1]
+        (tmp_path / "body.obj").write_text("\n".join(lines) + "\n")
+        medium = MediumSpec(Mesh(tmp_path / "body.obj"), 0.5, 0.1, (GrainSpec(table),), name="m")
+        camera = Camera((4.0, 0.0, 1.0), (0.0, 0.0, 0.0), 16, 16, fov_deg=25.0)
+        made = world.build(Scene(camera, (ConstantLight((1.0, 1.0, 1.0)),), (medium,), surfaces), "teleport")
+        picture = render.render(made, spp=4, threads=1)
+        assert picture.truncated == 0 and abs(float(picture.rgb.mean()) - 1.0) < 1e-12
+        assert made.place.arrays.convex == (name == "convex")
+        asked[name] = picture.rays / picture.samples.sum()
+    assert asked["convex"] < 1.1 < 1.4 < asked["dented"] < asked["floor"]

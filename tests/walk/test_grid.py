@@ -7,8 +7,8 @@ import pytest
 from numba import njit
 
 from tsdf.grain.grains import first_hit, load_grain, triangle_scene
-from tsdf.walk.geometry import planes_of
-from tsdf.walk.grid import OUTSIDE, Grid, compared, grid_of, line_of, march, plane_hit
+from tsdf.walk.geometry import box_mesh, planes_of, within
+from tsdf.walk.grid import OUTSIDE, UNKNOWN, Grid, compared, grid_of, home_of, line_of, march, plane_hit
 
 RAYS = 4000
 THICK = 1e-6
@@ -50,7 +50,9 @@ def ball(subdivisions: int = 2, radius: float = 1.0) -> np.ndarray:
 def made(*meshes: np.ndarray, cells: int = 3000, half: float = 1.1) -> Grid:
     planes = planes_of(np.concatenate(meshes))
     box = np.full(3, -half), np.full(3, half)
-    return grid_of(meshes, np.full(len(meshes), -1, np.int32), planes, np.full(len(planes), THICK), box, cells, 0.0, False)
+    return grid_of(
+        meshes, np.full(len(meshes), -1, np.int32), planes, np.full(len(planes), THICK), box, cells, 0.0, False
+    )
 
 
 def floor(z: float, size: float) -> np.ndarray:
@@ -115,3 +117,42 @@ def test_what_reaches_out_of_the_grid() -> None:
     known = rays(grid, np.zeros((2, 3)), d, np.array([0.5, math.inf]))[1]
     assert known.tolist() == [True, False]
     assert rays(made(floor(-1.0, 50.0)), np.zeros((2, 3)), d, np.array([0.5, math.inf]))[1].all()
+
+
+@njit
+def homes(grid, p, found, sums):
+    for i in range(p.shape[0]):
+        found[i] = home_of(grid, sums, (p[i, 0], p[i, 1], p[i, 2]))
+
+
+@pytest.mark.parametrize("cells", [1, 3000, 60_000])
+def test_in_which_mesh_a_place_is(cells: int) -> None:
+    """A dented ball that touches a box along a face, and a floor that is no medium's, against the ray engine."""
+    dented, beside, half = ball(2, 0.5), box_mesh((0.5, -0.4, -0.4), (1.0, 0.3, 0.4)), 1.1
+    dented = dented - (0.0, 0.0, 0.1)
+    other = box_mesh((0.5, 0.3, -0.4), (1.0, 0.7, 0.4))
+    meshes = [floor(-1.0, 50.0), dented, *(mesh.vertices[mesh.faces] for mesh in (beside, other))]
+    planes = planes_of(np.concatenate(meshes))
+    owner = np.array([-1, 2, 0, 1], np.int32)
+    grid = grid_of(meshes, owner, planes, np.full(len(planes), THICK), (np.full(3, -half), np.full(3, half)), cells,
+                   0.0, False)  # fmt: skip
+    rng = np.random.default_rng(3)
+    p, found = rng.uniform(-1.3, 1.3, (20_000, 3)), np.zeros(20_000, np.int64)
+    homes(grid, p, found, np.zeros(4, np.int32))
+    true = np.full(len(p), -1)
+    for mesh, m in zip(meshes[1:], owner[1:], strict=True):
+        engine = triangle_scene(mesh.reshape(-1, 3), np.arange(3 * len(mesh)).reshape(-1, 3).astype(np.int32))
+        true[within(engine, planes_of(mesh)[:, :3], p)] = m
+    sure = found != UNKNOWN
+    assert sure.mean() > 0.99 and set(true) == {-1, 0, 1, 2}
+    assert (found == true)[sure].mean() > 0.9999  # within the ray engine's rounding of a facet
+
+
+def test_open_meshes_have_no_inside() -> None:
+    """Along lines that enter it and leave through its hole."""
+    corners = ball()
+    meshes = [corners[corners.mean(axis=1)[:, 0] < 0.7]]
+    planes = planes_of(meshes[0])
+    grid = grid_of(meshes, np.zeros(1, np.int32), planes, np.full(len(planes), THICK),
+                   (np.full(3, -1.1), np.full(3, 1.1)), 3000, 0.0, False)  # fmt: skip
+    assert (grid.home == UNKNOWN).any() and (grid.home == 0).any()

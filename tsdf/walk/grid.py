@@ -33,15 +33,15 @@ class Grid(NamedTuple):
     """What kernels ask about a grid of cells (x, y, z) over meshes' facets (f,).
 
     low (3,), edge: its corner and the edge of a cell; free (x, y, z) float32: distances of the cells' middles to the
-    nearest facet, at most; rings (x y z,) int8: to how many cells from each, it counted, there are no facets, but
-    for its own, 1 at least; first (x y z + 1,) int32, listed: the facets in each cell, one cell after the other; home
-    (x y z,) int16: the medium in whose mesh a place near each cell's middle is, see `mark`, NONE or UNKNOWN, none of it
-    where no medium has one; outer:
-    the facets that reach out of the grid, if there are no more than OUTSIDE; closed: rays that leave the grid meet
-    nothing else; beyond: distances outside it are at least those to the grid. corners (f, 3, 3); planes (f, 4): normal
-    and height over the origin; mesh (f,) int32: the number of the facet's mesh; owner (meshes,) int32: the medium whose
-    boundary it is, NONE for surfaces; thickness (f,): how near to it counts as on it; margin: how far behind each other
-    rays may meet facets, wholly inside the grid, that are at one place.
+    nearest facet, at most; cells (x y z,) int32: the number of the cell among those with facets, or less than 0, how
+    many cells on the next of those is; first (occupied + 1,) int32, listed: the facets in each, one cell after the
+    other; slabs (occupied, 5): a direction, and between which heights along it all of them are; home (x y z,) int16:
+    the medium in whose mesh a place near each cell's middle is, see `mark`, NONE or UNKNOWN, empty where no medium has
+    a mesh; outer: the facets that reach out of the grid, if there are no more than OUTSIDE; closed: rays that leave the
+    grid meet nothing else; beyond: distances outside it are at least those to the grid. corners (f, 3, 3); planes
+    (f, 4): normal and height over the origin; mesh (f,) int32: the number of the facet's mesh; owner (meshes,) int32:
+    the medium whose boundary it is, NONE for surfaces; thickness (f,): how near to it counts as on it; margin: how far
+    behind each other rays may meet facets, wholly inside the grid, that are at one place.
     """
 
     low: np.ndarray
@@ -164,6 +164,22 @@ def compared(grid, met, facet, p, d, line, end):
     return t
 
 
+@njit(forceinline=True, **KERNEL)
+def searched(grid, met, what, p, d, line, inside, end):
+    """Note in `met` which facets of an occupied cell a ray meets, that is in it between two distances; return how far
+    it is still of interest."""
+    here, there = grid.first[what], grid.first[what + 1]
+    if there - here >= FEW:  # it may be on one side of all of them
+        n = (grid.slabs[what, 0], grid.slabs[what, 1], grid.slabs[what, 2])
+        at, by = dot(n, p), dot(n, d)
+        a, b = at + inside[0] * by, at + inside[1] * by
+        if min(a, b) > grid.slabs[what, 4] or max(a, b) < grid.slabs[what, 3]:
+            return end
+    for at in range(here, there):
+        end = min(end, compared(grid, met, grid.listed[at], p, d, line, end) + grid.margin)
+    return end
+
+
 @njit(**KERNEL)
 def march(grid, met, p, d, end):
     """Note in `met` (meshes,) the first facets that a ray meets, NONE where there is none; return whether it is known.
@@ -188,10 +204,7 @@ def march(grid, met, p, d, end):
             # Short ways mostly end in the cell in which they begin
             what = int(grid.cells[(i * ny + j) * nz + k])
             if what >= 0:
-                here, there = grid.first[what], grid.first[what + 1]
-                if there - here < FEW or not beside(grid, what, p, d, 0.0, end):
-                    for at in range(here, there):
-                        end = min(end, compared(grid, met, grid.listed[at], p, d, line, end) + grid.margin)
+                searched(grid, met, what, p, d, line, (0.0, end), end)
             return True
     # The ray enters the grid at t and leaves it at `last`
     t, last = 0.0, math.inf
@@ -220,11 +233,7 @@ def march(grid, met, p, d, end):
             return False
         what = int(grid.cells[cell])
         if what >= 0:
-            leaves = min(tx, min(ty, tz))
-            here, there = grid.first[what], grid.first[what + 1]
-            if there - here < FEW or not beside(grid, what, p, d, t, min(leaves, end)):
-                for at in range(here, there):
-                    end = min(end, compared(grid, met, grid.listed[at], p, d, line, end) + grid.margin)
+            end = searched(grid, met, what, p, d, line, (t, min(end, min(tx, min(ty, tz)))), end)
         if what >= -1:
             if tx <= ty and tx <= tz:
                 t = tx
@@ -254,15 +263,6 @@ def march(grid, met, p, d, end):
             tz += n * iz
             cell += n * nextz
     return False
-
-
-@njit(forceinline=True, **KERNEL)
-def beside(grid, what, p, d, t, end):
-    """Return whether a ray is on one side of all facets in an occupied cell between two places, both in it."""
-    n = (grid.slabs[what, 0], grid.slabs[what, 1], grid.slabs[what, 2])
-    at, by = dot(n, p), dot(n, d)
-    a, b = at + t * by, at + end * by
-    return min(a, b) > grid.slabs[what, 4] or max(a, b) < grid.slabs[what, 3]
 
 
 @njit(forceinline=True, **KERNEL)
@@ -421,13 +421,14 @@ def grid_of(meshes: Sequence[np.ndarray], owner: np.ndarray, planes: np.ndarray,
     few = int(outer.sum()) <= OUTSIDE
     home = np.full(free.size if (owner != NONE).any() else 0, NONE, np.int16)
     occupied = np.flatnonzero(first[1:] > first[:-1])
-    number = _rings(first, counts)
+    number = _steps(first, counts)
     number[occupied] = np.arange(len(occupied))
     first = first[np.append(occupied, len(first) - 1)]
     slabs = np.zeros((len(occupied), 5))
     find_slabs(corners, planes, first, listed, slabs)
-    grid = Grid(low, edge, free, number, slabs, first, listed, home, outer.nonzero()[0].astype(np.int32)[: OUTSIDE * few], few,
-                beyond, corners, planes, mesh, owner, thickness, margin)  # fmt: skip
+    reaching = outer.nonzero()[0].astype(np.int32)[: OUTSIDE * few]
+    grid = Grid(low, edge, free, number, slabs, first, listed, home, reaching, few, beyond, corners, planes, mesh,
+                owner, thickness, margin)  # fmt: skip
     if home.size:
         find_homes(Handle(grid), grid.home, np.zeros(len(owner), np.int32))
     return grid
@@ -455,8 +456,8 @@ def meets(corners: np.ndarray, planes: np.ndarray, low: np.ndarray, high: np.nda
     return met
 
 
-def _rings(first: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return the parts of `Grid.cells` that are empty."""
+def _steps(first: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return `Grid.cells` for those that are empty, (x y z,) int32."""
     from scipy.ndimage import distance_transform_cdt
 
     empty = (first[1:] == first[:-1]).reshape(tuple(counts))
