@@ -328,25 +328,7 @@ def home_of(grid, sums, p):
 # --------------------------------------------------------------------------------------------- from meshes
 
 
-@njit(cache=True)
-def find_slabs(corners, planes, first, listed, slabs):
-    """Write to `slabs` (occupied, 5) a mean normal of the facets in each cell, and between which heights they are."""
-    for what in range(len(slabs)):
-        x = y = z = 0.0
-        for at in range(first[what], first[what + 1]):
-            f = listed[at]
-            x, y, z = x + planes[f, 0], y + planes[f, 1], z + planes[f, 2]
-        low, high, size = math.inf, -math.inf, 0.0
-        for at in range(first[what], first[what + 1]):
-            for k in range(3):
-                p = (corners[listed[at], k, 0], corners[listed[at], k, 1], corners[listed[at], k, 2])
-                up = dot((x, y, z), p)
-                low, high, size = min(low, up), max(high, up), max(size, abs(p[0]) + abs(p[1]) + abs(p[2]))
-        off = ROUNDING * size * (abs(x) + abs(y) + abs(z))
-        slabs[what, 0], slabs[what, 1], slabs[what, 2], slabs[what, 3], slabs[what, 4] = x, y, z, low - off, high + off
-
-
-@njit(cache=True)
+@njit(**KERNEL)
 def find_homes(grid, home, sums):
     """Write the medium of each cell's mark to `home` (x y z,): NONE at the grid's walls, and then as facets are
     crossed along x; `sums` (meshes,) is used. UNKNOWN where rounding could matter."""
@@ -424,8 +406,7 @@ def grid_of(meshes: Sequence[np.ndarray], owner: np.ndarray, planes: np.ndarray,
     number = _steps(first, counts)
     number[occupied] = np.arange(len(occupied))
     first = first[np.append(occupied, len(first) - 1)]
-    slabs = np.zeros((len(occupied), 5))
-    find_slabs(corners, planes, first, listed, slabs)
+    slabs = _slabs(corners, planes, first, listed)
     reaching = outer.nonzero()[0].astype(np.int32)[: OUTSIDE * few]
     grid = Grid(low, edge, free, number, slabs, first, listed, home, reaching, few, beyond, corners, planes, mesh,
                 owner, thickness, margin)  # fmt: skip
@@ -464,6 +445,21 @@ def _steps(first: np.ndarray, counts: np.ndarray) -> np.ndarray:
     if empty.all():
         return np.full(empty.size, -int(counts.max()), np.int32)
     return -distance_transform_cdt(empty, "chessboard").astype(np.int32).ravel()
+
+
+def _slabs(corners: np.ndarray, planes: np.ndarray, first: np.ndarray, listed: np.ndarray) -> np.ndarray:
+    """Return `Grid.slabs`, along the sums of the facets' normals."""
+    slabs, many = np.zeros((len(first) - 1, 5)), BATCH // 8
+    farthest = float(np.abs(corners).max())
+    for begin in range(0, len(slabs), many):
+        starts = first[begin : begin + many + 1]
+        own, at = listed[starts[0] : starts[-1]], starts[:-1] - starts[0]
+        way = np.add.reduceat(planes[own, :3], at, axis=0)
+        heights = np.einsum("ikj,ij->ik", corners[own], np.repeat(way, np.diff(starts), axis=0))
+        off = ROUNDING * farthest * np.abs(way).sum(axis=1)
+        low, high = np.minimum.reduceat(heights.min(axis=1), at), np.maximum.reduceat(heights.max(axis=1), at)
+        slabs[begin : begin + many] = np.column_stack((way, low - off, high + off))
+    return slabs
 
 
 def _batches(*arrays: np.ndarray) -> list[tuple[np.ndarray, ...]]:
