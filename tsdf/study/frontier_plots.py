@@ -130,14 +130,18 @@ def _against_bytes(axes: Any, frontier: Frontier) -> None:
     """Draw floors over the bytes that a candidate draws from."""
     axes.set_xscale("log")
     axes.set_yscale("log")
-    shown = []
     fills = dict(zip(_singles([frontier]), ("full", "none", "left", "bottom"), strict=False))
-    for row in frontier.rows:
+    drawn = [row for row in frontier.rows if not frontier.exact(row) and row.floor.high > 0.0]
+    if drawn:  # first, for an arrow alone has no width to be laid out by
+        tops = [100.0 * row.floor.high for row in drawn]
+        feet = [100.0 * (max(f.low, 0.5 * f.high) if f.seen else 0.7 * f.high) for f in (row.floor for row in drawn)]
+        axes.set_ylim(0.7 * min(feet), 1.4 * max(tops))
+        sizes = [row.bytes / 1000.0 for row in frontier.rows]
+        axes.set_xlim(min(sizes) / 2.0, 2.0 * max(sizes))
+    for row in drawn:
         value, low, high = (100.0 * x for x in row.floor[:3])
         level = LEVELS[row.candidate.level]
         kilobytes = row.bytes / 1000.0
-        if frontier.exact(row) or not high > 0.0:
-            continue
         if row.floor.seen:
             axes.errorbar(
                 kilobytes, value, [[value - max(low, 1e-9)], [high - value]], fmt=level.mark, markersize=5, capsize=2,
@@ -147,11 +151,6 @@ def _against_bytes(axes: Any, frontier: Frontier) -> None:
             axes.errorbar(
                 kilobytes, high, 0.25 * high, fmt="none", uplims=True, capsize=3, elinewidth=0.8, color=level.colour
             )
-        shown += [high, max(low, 0.5 * high) if row.floor.seen else 0.7 * high]
-    if shown:
-        axes.set_ylim(0.7 * min(shown), 1.4 * max(shown))
-        sizes = [row.bytes / 1000.0 for row in frontier.rows]
-        axes.set_xlim(min(sizes) / 2.0, 2.0 * max(sizes))
     _decades(axes)
     axes.set_xlabel("kilobytes that are drawn from")
     axes.set_ylabel("floor: what time does not mend [%], arrows: below")
