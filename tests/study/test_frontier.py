@@ -190,6 +190,23 @@ def test_runs_share_no_random_numbers_but_packings(ball: Scene) -> None:
     assert np.array_equal(first[0].arrays.centres[0], own) and not np.array_equal(second[0].arrays.centres[0], own)
 
 
+def test_leaps_are_candidates_of_the_levels_that_leap(ball: Scene) -> None:
+    """Each radius once, smallest first, none before those of the scene; explicit grains never leap. In a ball too small
+    for them all are the same level, told apart by name, line and random numbers."""
+    chosen = frontier.leaping(candidates(("explicit", "teleport"), (0, 2)), [4.0, 0.0, 4.0])
+    names = ["explicit", "teleport k=2 leap=0", "teleport k=2 leap=4", "teleport leap=0", "teleport leap=4"]
+    assert [str(one) for one in chosen] == names
+    assert frontier.leaping(chosen[:1], [None]) == chosen[:1]
+    made = frontier.measure(ball, chosen, seconds=0.3, runs=2, threads=1)
+    assert made is not None and [str(row.candidate) for row in made.rows] == names
+    assert made.rows[-1].noise != made.rows[-2].noise
+    figure = frontier_plots.plot_frontier(made)
+    shown = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert shown[-2:] == ["no leaps", "leaps from 4 on"]
+    widths = {line.get_linewidth() for line in figure.axes[0].get_lines() if len(line.get_xdata()) > 20}
+    assert len(widths) >= 2
+
+
 def test_bytes_are_of_what_a_level_draws_from(found: Frontier) -> None:
     """Cheaper levels hold less, explicit grains hold more, and points know no table."""
     held = {str(row.candidate): row.bytes for row in found.rows}
@@ -465,6 +482,9 @@ def test_command_writes_results_and_draws_them_again(tmp_path: Path, capsys: pyt
         (["scene.toml", "--out", "o", "--levels", "teleprot"], 2, "did you mean teleport"),
         (["scene.toml", "--out", "o", "--grains", "1,-2"], 2, "--grains"),
         (["scene.toml", "--out", "o", "--grains", "1.5"], 2, "--grains"),
+        (["scene.toml", "--out", "o", "--leaps", "0,x"], 2, "--leaps"),
+        (["scene.toml", "--out", "o", "--leaps", "0.5"], 2, "--leaps"),
+        (["scene.toml", "--out", "o", "--leaps", "nan"], 2, "--leaps"),
         (["scene.toml", "--out", "o", "--runs", "1"], 2, "--runs is"),
         (["scene.toml", "--out", "o", "--seconds", "0"], 2, "--seconds is"),
         (["empty.json", "--out", "o", "--levels", "volume", "--seed", "0"], 2, "--levels, --seed: saved results"),

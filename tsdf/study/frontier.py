@@ -396,6 +396,14 @@ def seeing(scene: Scene, ways: Sequence[Way], sized: Sizing, share: float, left:
     return found
 
 
+def leaping(chosen: Sequence[Candidate], leaps: Sequence[float | None]) -> tuple[Candidate, ...]:
+    """Return candidates with each of these least radii of leaps, smallest first; once where a level cannot leap."""
+    radii = sorted(set(leaps), key=lambda leap: -1.0 if leap is None else leap)
+    return tuple(
+        one._replace(leap=leap) for one in chosen for leap in (radii if LEVELS[one.level].traits.leaps else (None,))
+    )
+
+
 def stream_of(candidate: Candidate) -> int:
     """Return the stream of random numbers of a candidate, from 1 on; another for each, whatever else is measured."""
     stream = 1 + list(LEVELS).index(candidate.level) + len(LEVELS) * candidate.explicit_grains

@@ -18,6 +18,7 @@ from tsdf.study.plots import STYLE, literal
 from tsdf.study.ranking import mean_of
 
 LINES: Any = ("-", "--", ":", "-.")  # by the number of explicit grains, fewest first
+WIDTHS = (1.1, 2.4, 0.5)  # of lines, by the least radius of leaps, as the scene says first
 ONWARD = 30.0  # how much farther than the measured times a line goes
 COLUMNS = 3  # of charts beside each other
 STEPS = {1.2: (1.0, 1.5, 2.0, 3.0, 5.0, 7.0), 2.2: (1.0, 2.0, 5.0), 3.5: (1.0, 3.0)}  # of a decade, by decades shown
@@ -74,7 +75,7 @@ def _against_time(axes: Any, frontier: Frontier) -> None:
         seconds = np.geomspace(low, high, 200)
         error = np.sqrt((floor.value**2 if floor.seen else 0.0) + noise / seconds)
         known = error > (0.0 if floor.seen else floor.high)  # below the limit nobody knows
-        axes.plot(seconds[known], 100.0 * error[known], _line(frontier, row), linewidth=1.1, **style)
+        axes.plot(seconds[known], 100.0 * error[known], _line(frontier, row), linewidth=_width(frontier, row), **style)
         if not floor.seen and known.any() and floor.high > 0.0:
             end = seconds[known][-1]
             axes.annotate(
@@ -182,8 +183,19 @@ def _line(frontier: Frontier, row: Measured) -> Any:
     return LINES[min(_singles([frontier]).index(row.candidate.explicit_grains), len(LINES) - 1)]
 
 
+def _leaps(frontiers: Sequence[Frontier]) -> list[float]:
+    """Return the least radii of leaps that candidates name."""
+    leaps = {row.candidate.leap for frontier in frontiers for row in frontier.rows}
+    return sorted(leap for leap in leaps if leap is not None)
+
+
+def _width(frontier: Frontier, row: Measured) -> float:
+    leap = row.candidate.leap
+    return WIDTHS[0 if leap is None else min(_leaps([frontier]).index(leap), len(WIDTHS) - 1)]
+
+
 def _keys(frontiers: Sequence[Frontier]) -> list[Any]:
-    """Return what the legend shows: colours and marks are levels, lines are explicit grains."""
+    """Return what the legend shows: colours and marks are levels, lines are explicit grains, their widths leaps."""
     from matplotlib.lines import Line2D
 
     shown = {row.candidate.level for frontier in frontiers for row in frontier.rows}
@@ -195,5 +207,10 @@ def _keys(frontiers: Sequence[Frontier]) -> list[Any]:
     keys += [
         Line2D([], [], color="0.3", linestyle=LINES[min(n, len(LINES) - 1)], label=f"{k} explicit grains first")
         for n, k in enumerate(singles) if k
+    ]  # fmt: skip
+    keys += [
+        Line2D([], [], color="0.3", linewidth=WIDTHS[min(n, len(WIDTHS) - 1)],
+               label=f"leaps from {leap:g} on" if leap else "no leaps")
+        for n, leap in enumerate(_leaps(frontiers))
     ]  # fmt: skip
     return keys
