@@ -212,7 +212,7 @@ def table(result: Result) -> list[str]:
     found, peers = result
     lines = []
     for name, (peer, same) in peers.items():
-        slower = mean_of(peer.noise_seconds).value / mean_of(same.noise_seconds).value
+        slower = float(np.median(peer.noise_seconds) / np.median(same.noise_seconds))  # one run may have a firefly
         bias = mean_of(np.array(peer.bias["whole"]) - same.bias["whole"])
         print(f"{found.scene}: {name} takes {slower:.2g} times as long to the noise of our {same.candidate}; "
               f"bias to it {100.0 * bias.value:+.2f} +- {100.0 * bias.error:.2f} %")  # fmt: skip
