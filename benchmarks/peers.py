@@ -274,10 +274,8 @@ class PhotonTracer:
 
         self.scene, self.light = scene, _sky(scene)
         self.medium, tables = medium_of(scene)
-        camera, um = (
-            scene.camera,
-            0.5,
-        )  # any wavelength does: k makes the absorption coefficient [1/um], and a unit is 1 um
+        camera = scene.camera
+        um = 0.5  # any wavelength does: k makes the absorption coefficient [1/um], and a unit is 1 um
         self.meshes, materials = [], [pt.Material(pt.MaterialType.REFRACTIVE, 1.0 + 0.0j)]
         for spec, table in zip(self.medium.grains, tables, strict=True):
             vertices, faces = facets_of(explicit.exemplar(spec, table, scene.name, scene.folder))

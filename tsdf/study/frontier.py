@@ -335,13 +335,14 @@ class Sizing:
         """Return how many samples of a pixel fit into a share of a run."""
         return _affordable(world, share * self.seconds, self.seed, self.threads, self.stop)
 
-    def met(self, world: World, samples: int) -> float:
-        """Return how often all runs meet suns and small bright lights that a world finds by chance alone, about;
-        infinite where it aims at them, or there are none."""
-        if not (world.media.singles and world.scene.media and world.lights.sampled):
-            return math.inf
+    def blind(self, world: World, samples: int) -> bool:
+        """Return whether all runs together meet suns and small bright lights too seldom, for a world that finds them by
+        chance alone."""
+        if not (world.media.singles and world.scene.media and world.lights.sampled) or self.stop.is_set():
+            return False
         camera = world.scene.camera
-        return samples * self.runs * camera.width * camera.height / kurtosis_of(world.lights)
+        met = samples * self.runs * camera.width * camera.height / kurtosis_of(world.lights)
+        return met < MEETINGS
 
 
 class Left(dict[str, list[str]]):
@@ -374,7 +375,7 @@ def truth_of(scene: Scene, sized: Sizing, left: Left) -> Way:
             failed = failed or error
             left.add(str(error), str(candidate))
             continue
-        if sized.met(world, LEAST_SAMPLES) < MEETINGS and sized.met(world, sized.of(world, TRUTH)) < MEETINGS:
+        if sized.blind(world, LEAST_SAMPLES) and sized.blind(world, sized.of(world, TRUTH)):
             left.add(BLIND, str(candidate))
             continue
         return Way(candidate, world, 0)
@@ -387,7 +388,7 @@ def seeing(scene: Scene, ways: Sequence[Way], sized: Sizing, share: float, left:
     found = []
     for way in ways:
         way.samples = sized.of(way.world, share / len(ways))
-        if sized.met(way.world, way.samples) < MEETINGS:
+        if sized.blind(way.world, way.samples):
             left.add(BLIND, str(way))
         else:
             found.append(way)
