@@ -377,7 +377,7 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
             else:
                 p = step(p, scale, offset)
                 bound -= size
-        if luck < DIM:
+        if luck < DIM and w.mode != JUMP:  # a jump that ends on a boundary gives some of its length back
             w.luck = luck
             key += GOLDEN
             if not lives(w, key):
@@ -558,7 +558,9 @@ def land(world, batch, w, amounts):
         if w.shadow:
             return ENDED
         if slot >= 0:
-            amounts[slot] -= w.gained * max(0.0, 1.0 - t / w.length)
+            back = w.gained * max(0.0, 1.0 - t / w.length)
+            amounts[slot] -= back
+            w.luck -= world.absorption.least[slot] * back
         return bounce(world, batch, w, amounts, e, (t, surface, n, slack))
     move = min(beyond(slack_b, dot(n_b, e)), 0.5 * (t - t_b)) if inside else 0.0
     if leaves:
@@ -575,7 +577,9 @@ def land(world, batch, w, amounts):
     w.mode, w.free = FLY, -1.0
     if leaves:
         if slot >= 0:
-            amounts[slot] -= w.gained * (1.0 - t_b / w.length)
+            back = w.gained * (1.0 - t_b / w.length)
+            amounts[slot] -= back
+            w.luck -= world.absorption.least[slot] * back
         outward = dot(triple(w.q), n_b)
         if outward < 0.0:
             move = -min(move, 0.5 * t_b)
