@@ -748,16 +748,20 @@ def meet_grain(world, batch, w, amounts):
             return WAIT
         w.mode = FLY
         return ENDED
-    e = world.grains.exemplar[w.component]
-    if e == X.EXACT_SPHERE:
-        return in_grain(world, batch, w, amounts, NONE)
-    if w.ray >= 0:
-        return in_grain(world, batch, w, amounts, batch.grain_hits[e, w.ray])
-    w.ray = batch.asked[GRAINS_ASKED + e]
-    for k in range(3):
-        batch.grain_starts[e, w.ray, k], batch.grain_ways[e, w.ray, k] = w.e[k], w.d[k]
-    batch.asked[GRAINS_ASKED + e] += 1
-    return WAIT
+    grains, facet = world.grains, NONE
+    e = grains.exemplar[w.component]
+    if e != X.EXACT_SPHERE:
+        if grains.first_side[e] < grains.first_side[e + 1]:
+            facet = X.side_met(grains, e, w)
+        elif w.ray >= 0:
+            facet = batch.grain_hits[e, w.ray]
+        else:
+            w.ray = batch.asked[GRAINS_ASKED + e]
+            for k in range(3):
+                batch.grain_starts[e, w.ray, k], batch.grain_ways[e, w.ray, k] = w.e[k], w.d[k]
+            batch.asked[GRAINS_ASKED + e] += 1
+            return WAIT
+    return in_grain(world, batch, w, amounts, facet)
 
 
 @njit(**KERNEL)
