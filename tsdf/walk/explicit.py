@@ -2,8 +2,8 @@
 
 A medium is filled by a periodic tile of spheres (`packing`), in which a grain stands where there is room (`room`).
 Which exemplar it is and how it is turned are functions of its place. Light enters a bounding sphere, is brought into
-the grain's frame, and goes one way at each hit, as in nature. The exact sphere and convex grains of few sides, cubes and
-prisms, are followed here without a ray engine; all other grains share one ray-engine scene for each exemplar.
+the grain's frame, and goes one way at each hit, as in nature. The exact sphere and convex grains of few sides, cubes
+and prisms, are followed here without a ray engine; all other grains share one ray-engine scene for each exemplar.
 """
 
 import math
