@@ -1,10 +1,12 @@
 """Where things are: distances against brute force, bounds that are bounds, media that are refused."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from numba import njit
 
 from tsdf.errors import SceneError
@@ -269,3 +271,33 @@ def test_who_leaves_a_lone_convex_mesh_asks_no_more(tmp_path, table):
         assert made.place.arrays.convex == (name == "convex")
         asked[name] = picture.rays / picture.samples.sum()
     assert asked["convex"] < 1.1 < 1.4 < asked["dented"] < asked["floor"]
+
+
+class Slips:
+    """A ray engine whose rays slip through the first facet that they meet from outside."""
+
+    def __init__(self, engine, corners):
+        self.engine, self.planes = engine, geometry.planes_of(corners)
+
+    def run(self, starts, ways):
+        found = self.engine.run(starts, ways)
+        plane = self.planes[np.maximum(found, 0)]
+        cosine = np.einsum("ij,ij->i", plane[:, :3], ways)
+        t = (plane[:, 3] - np.einsum("ij,ij->i", plane[:, :3], starts)) / np.where(cosine == 0.0, 1.0, cosine)
+        beyond = (starts + (t * 1.0001 + 1e-3)[:, None] * ways).astype(np.float32)
+        return np.where((found >= 0) & (cosine < 0.0), self.engine.run(beyond, ways), found)
+
+
+def test_what_slips_through_a_mesh_is_not_in_it(table, tmp_path):
+    """A camera's ray that the ray engine lets through a ball's front is outside when it meets the back, far from it."""
+    trimesh.creation.icosphere(3, radius=10.0).export(tmp_path / "ball.ply")
+    medium = MediumSpec(Mesh(tmp_path / "ball.ply"), 0.5, 1.0, (GrainSpec(table),), name="ball")
+    camera = Camera((0.0, -60.0, 5.0), (0.0, 0.0, 0.0), 16, 16, fov_deg=15.0)
+    made = world.build(Scene(camera, (ConstantLight((1.0, 1.0, 1.0)),), (medium,), name="slips"), "volume")
+    whole = render.render(made, spp=4)
+    corners = made.place.boundaries[0].vertices[made.place.boundaries[0].faces]
+    place = replace(made.place, engines=[Slips(made.place.engines[0], corners)])
+    limited = made.media._replace(limit=1000)  # what is lost never ends
+    slipped = render.render(replace(made, place=place, brim=place, media=limited), spp=4)
+    assert whole.events > 4000 and (whole.rgb == 1.0).all()
+    assert slipped.events == 0 and slipped.truncated == 0 and (slipped.rgb == 1.0).all()
