@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from plan_scenes import scenes
 
 from tsdf.picture import render, world
