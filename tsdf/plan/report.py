@@ -198,6 +198,7 @@ def chosen_facts(plan: Plan) -> dict[str, Any]:
         "level": one.level,
         "explicit_grains": one.explicit_grains,
         "fewer_far": plan.fewer_far,
+        "leap": one.leap,
         "target": plan.target,
         "noise": plan.noise,
     }
@@ -209,6 +210,8 @@ def options(plan: Plan) -> str:
     words = f"--level {one.level}"
     if one.explicit_grains:
         words += f" --explicit-grains {one.explicit_grains}" + "-0" * plan.fewer_far
+    if one.leap is not None:
+        words += f" --leap {one.leap:g}"
     return words
 
 
