@@ -16,7 +16,7 @@ from tsdf.errors import SceneError, UsageError
 from tsdf.picture.trust import kurtosis_of
 from tsdf.picture.world import World, build
 from tsdf.plan import needs, prior
-from tsdf.plan.evidence import BOLD, BOLD_BIAS, GRAINS, Evidence
+from tsdf.plan.evidence import BOLD, BOLD_BIAS, GRAINS, Evidence, singly
 from tsdf.plan.pilot import FEWEST, HALVES, PIXELS, Pilot
 from tsdf.plan.prediction import Plan, Prediction
 from tsdf.plan.report import why
@@ -144,6 +144,7 @@ class _Planning(Evidence):
         left = max(self.budget - self.spent, LEAST_PILOTS)
         self.ends = self.spent + left
         self.round(FIRST * left, list(self.pilots))
+        self.refer_anew()
         self.round((1.0 - FIRST - CHECK) * left, self.finalists())
         self.weigh()
         chosen, found = self.settled()
@@ -298,6 +299,16 @@ class _Planning(Evidence):
         if self.reference.level != "explicit" and "explicit" in self.impossible:
             self.notes.append(f"no level explicit here, {self.reference} stands for it: {self.impossible['explicit']}")
 
+    def refer_anew(self) -> None:
+        """Hold levels against the best that aims at lights, where the pilot of the best has met them too seldom."""
+        assert self.reference is not None
+        best = self.pilots[self.reference]
+        if self.trusted(best) or not self.chance:
+            return
+        aimed = [one for one in self.pilots if not singly(one) and self.trusted(self.pilots[one])]
+        if aimed:
+            self.reference = min(aimed, key=lambda one: list(LEVELS).index(one.level))
+
     def contenders(self) -> list[str]:
         """Return levels that may meet the target, those first of which most is expected."""
         order = ("teleport-memory", "volume", "teleport-packed", "teleport", "teleport-joint", "volume-hg", "isotropic")
@@ -342,14 +353,14 @@ class _Planning(Evidence):
         elif any(map(self.hidden, candidates(tuple(LEVELS), GRAINS))):
             self.notes.append(
                 "single grains meet suns and small bright lights by chance alone, too seldom for pilots: what they "
-                "take is not known, and they are left out for levels that aim at lights, whose errors are what is "
-                "expected of slabs; a wider sun brings them back"
+                "take is not known, and they are left out for levels that aim at lights, whose missing texture is what "
+                "is expected; a wider sun brings them back"
             )
         elif self.rarer > 1.0:
             self.notes.append(
                 f"single grains meet suns by chance alone, so pilots look at suns of {WIDE:g} degrees: under smaller "
-                "ones the others miss rather more texture than is said, and candidates with single grains take "
-                f"up to {self.rarer:.2g} times as long, as is said"
+                "ones other levels miss rather more texture than is said; candidates with single grains take "
+                f"{_digits(self.rarer)} times as long as they did in pilots, at most, and that is said"
             )
 
     def finalists(self) -> list[Candidate]:
@@ -402,3 +413,8 @@ def loaded(scene: Scene) -> tuple[Scene, list[Table]]:
             grains.append(replace(grain, table=table, mesh=mesh))
         media.append(replace(medium, grains=tuple(grains)))
     return replace(scene, media=tuple(media)), tables
+
+
+def _digits(number: float) -> str:
+    """Return a number of at least 1 with two digits."""
+    return f"{number:.2g}" if number < 99.5 else f"{float(f'{number:.2g}'):.0f}"

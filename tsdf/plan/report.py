@@ -98,6 +98,8 @@ def _reason(plan: Plan, bodies: Sequence[Body], footprint: float, coverage: floa
 def _other(plan: Plan) -> str:
     if len(plan.predictions) < 2:
         return "no other candidate is possible"
+    if plan.able is not None and plan.spp is None and not plan.chosen.seconds(plan.target) <= plan.able:
+        return _short_of_time(plan, plan.able)
     second, chosen = plan.predictions[1], plan.chosen
     takes = second.safe_seconds(plan.target)
     runner = f"runner-up: {second.candidate}, {span(takes)}" if math.isfinite(takes) else (
@@ -120,6 +122,19 @@ def _other(plan: Plan) -> str:
         if changes
         else f"{runner}; no other target would change this"
     )
+
+
+def _short_of_time(plan: Plan, able: float) -> str:
+    assert plan.seconds is not None
+    known = [p for p in plan.predictions[1:] if math.isfinite(p.variance)] or plan.predictions[1:]
+    second = min(known, key=lambda p: p.error(able))
+    runner = f"runner-up: {second.candidate}, an error of {percent(second.error(able))} then"
+    best = min(plan.predictions, key=lambda p: p.safe_seconds(plan.target))
+    takes = best.safe_seconds(plan.target) * plan.load
+    if not math.isfinite(takes):
+        return f"{runner}; no time is known to be enough for {percent(plan.target)}"
+    more = f"{best.candidate} and {span(takes)} instead of {span(plan.seconds)}"
+    return f"{runner}; {percent(plan.target)} would take {more}"
 
 
 def table(plan: Plan) -> list[str]:
