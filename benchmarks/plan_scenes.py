@@ -96,6 +96,7 @@ def scenes(folder: Path) -> Iterator[tuple[str, dict[str, Any], tuple[float, flo
     yield "++dilute salt", made(ball(18), [salt], 0.08, [SKY, BEHIND], 90, 20, 18, 30), (0.03, 0.08)
     # fmt: on
     yield from sceptical(folder)
+    yield from last(folder)
 
 
 def moved(medium: dict[str, Any], x: float, y: float = 0.0, z: float = 0.0) -> dict[str, Any]:
@@ -183,4 +184,30 @@ def sceptical(folder: Path) -> Iterator[tuple[str, dict[str, Any], tuple[float, 
         own = [grain(dune, [0.02, 0.06, 0.2], 0.85), grain(few, 0.01, 0.15)]
         yield "+++grains of one's own", made(box(40, 40, 12), own, 0.55, [SKY, LOW_SUN], 80, 45, 5), (0.05, 0.1)
         yield "+++beads", shipped("beads"), (0.05, 0.15)
+    # fmt: on
+
+
+def last(folder: Path) -> Iterator[tuple[str, dict[str, Any], tuple[float, float]]]:
+    """Yield the set ++++."""
+    glass, salt, sugar, sand = (grain(name) for name in ("glass-beads", "salt", "sugar", "sand"))
+    quartz, snow, fresh, plates = (grain(name) for name in ("quartz", "coarse-snow", "fresh-snow", "plates"))
+    tea, ink = grain("glass-beads", [0.01, 0.05, 0.2]), grain("quartz", 0.6, 0.2)
+    lamp = {"type": "sun", "direction": [-0.3, -1.0, 0.5], "irradiance": [1.0, 1.2, 1.4], "angular_diameter_deg": 25.0}
+    pillar = {"shape": {"type": "box", "low": [-4, -30, 0], "high": [4, -24, 24]}, "reflectance": [0.1, 0.4, 0.6]}
+    wall = {"type": "box", "low": [-40, 0, 0.02], "high": [40, 6, 40]}
+    # fmt: off
+    yield "++++tea", made(ball(14), [tea], 0.6, [SKY, lamp], 70, 40, 14, 30, True), (0.03, 0.1)
+    yield "++++a wall of sand", made(wall, [sand], 0.58, [WHITE], 110, 30, 20, 40, True, "centres"), (0.04, 0.1)
+    yield "++++coast", made(heap(folder, 60, 18), [salt], 0.45, [SKY, LOW_SUN], 90, 14, 10, 50, True), (0.05, 0.12)
+    yield "++++crystal", made(ball(6), [quartz], 0.3, [SKY, lamp], 26, 10, 6, 30), (0.05, 0.15)
+    yield "++++cirrus", made(box(200, 200, 60), [plates], 0.02, [SKY, NOON], 300, 180, 30, 40), (0.03, 0.08)
+    peppered = made(box(36, 36, 10), [sugar, ink], 0.5, [SKY, lamp], 60, 60, 4, inside="centres")
+    yield "++++peppered", peppered, (0.05, 0.1)
+    shade = made(box(90, 60, 14), [snow], 0.45, [SKY, lamp], 150, 90, 8, 40)
+    yield "++++in the shade", {**shade, "surface": [FLOOR, pillar]}, (0.03, 0.08)
+    deep = made({"type": "slab", "low": 0.02, "high": 120}, [glass], 0.6, [SKY, NOON], 200, 260, 110, 40)
+    yield "++++deep glass", deep, (0.02, 0.05)
+    sunny = made(ball(25), [fresh], 0.3, [SKY, SMALL_SUN], 500, 150, 25, 8, True)
+    yield "++++fresh snow in the sun", sunny, (0.05, 0.1)
+    yield "++++dust", scaled(made(ball(20), [snow, sand], 0.15, [SKY, NOON], 110, 40, 20, 28), 1e-5), (0.03, 0.08)
     # fmt: on

@@ -145,7 +145,7 @@ def test_a_small_sun_is_left_to_levels_that_aim_at_it(ball: tsdf.Table, sky: flo
     made = plan(scene, 0.05, threads=2)
     one = made.chosen.candidate
     assert not one.explicit_grains and not LEVELS[one.level].traits.packed
-    assert any("pilots look at suns of 16 degrees" in note for note in made.notes)
+    assert any("pilots look at suns" in note for note in made.notes)
     assert 100.0 * made.chosen.variance < of(made, "explicit").variance < math.inf
     assert made.chosen.piloted and 0.1 < made.chosen.texture < 1.5 and made.chosen.floor.error < made.chosen.texture
     assert f"{made.chosen.candidate}" in made.why[0] and json.dumps(report.facts(made), allow_nan=False)
@@ -161,7 +161,7 @@ def test_a_small_sun_is_left_to_levels_that_aim_at_it(ball: tsdf.Table, sky: flo
 
 def test_what_single_grains_take_under_a_small_sun(ball: tsdf.Table) -> None:
     """Is about what a picture at level explicit has, under a sun that this meets often enough to tell: 4 degrees, a
-    sixteenth of what pilots look at. It is an upper bound, for not all of the variance is the sun's."""
+    small part of what pilots look at. It is an upper bound, for not all of the variance is the sun's."""
     scene = replace(pile(ball, 9.0), lights=(replace(SUN, angular_diameter_deg=4.0),))
     said = of(plan(scene, 0.2, threads=2), "explicit")
     picture = render.render(world.build(scene, "explicit"), spp=2000, seed=3, threads=2)

@@ -16,7 +16,7 @@ from tsdf.errors import SceneError, UsageError
 from tsdf.picture.trust import kurtosis_of
 from tsdf.picture.world import World, build
 from tsdf.plan import needs, prior
-from tsdf.plan.evidence import BOLD, BOLD_BIAS, GRAINS, Evidence, singly
+from tsdf.plan.evidence import BOLD, BOLD_BIAS, GRAINS, MEETINGS, Evidence, singly
 from tsdf.plan.pilot import FEWEST, HALVES, PIXELS, Pilot
 from tsdf.plan.prediction import Plan, Prediction
 from tsdf.plan.report import why
@@ -42,7 +42,9 @@ MOST_FINALISTS = 4
 LATEST = 0.7  # of the time, after which nothing more is made ready for the second round
 CHECK = 0.15  # of what is left for pilots, for looks at what is chosen and was not seen
 BRIEF, MOST_CHECKS = 0.3, 3  # [s] that such a look takes at least, and how many there are at most
-WIDE = 16.0  # [deg] that suns have in pilots at least: single grains meet smaller ones by chance alone
+WIDE, WIDEST = 16.0, 50.0  # [deg] of suns in pilots that are smaller in the picture, which single grains would hardly
+# ever meet, at least and at most
+ENOUGH = 2.0  # times `MEETINGS` that they are to be met in the time that the reference has
 NEAR = 3.0  # times as long as the best as a candidate may seem to take to be looked at again
 EVENT_S = (1.0e-6, 5.0e-6)  # [s] of one explicit grain, an exact sphere and one of facets, about
 TIE = 1.1  # times as long as the cheapest as it may take, of those the one with the least error is taken
@@ -130,6 +132,7 @@ class _Planning(Evidence):
         self.ends = self.budget  # of the time that is spent
         self.places: dict[bool, Place] = {}
         self.packings: dict[bool, Packed] = {}
+        self.wide = WIDE  # [deg] of suns in pilots, at least
         self.dear = False  # whether single grains cannot be piloted
 
     def plan(self) -> Plan:
@@ -219,9 +222,12 @@ class _Planning(Evidence):
 
     def widen(self) -> None:
         """Have pilots look at suns that single grains meet often enough to tell what other levels miss."""
+        samples = OF_REFERENCE * self.budget * self.threads / max(self.sample(), 1e-9)
+        share = ENOUGH * MEETINGS / max(samples * self.coverage, 1e-9)  # of the sphere
+        self.wide = min(max(WIDE, math.degrees(4.0 * math.asin(math.sqrt(min(share, 1.0))))), WIDEST)
         lights = tuple(
-            replace(light, angular_diameter_deg=max(light.angular_diameter_deg, WIDE))
-            if isinstance(light, SunLight)
+            replace(light, angular_diameter_deg=self.wide)
+            if isinstance(light, SunLight) and light.angular_diameter_deg < WIDE
             else light
             for light in self.scene.lights
         )
@@ -250,6 +256,10 @@ class _Planning(Evidence):
             events = max(events, min(met, 1.0 / max(1.0 - body.albedo, 1e-12)))
         return self.coverage * events
 
+    def sample(self) -> float:
+        """Return about what a sample of level explicit takes of one thread [s]."""
+        return self.met() * EVENT_S[any(table.header["grain"]["kind"] != "sphere" for table in self.tables)]
+
     def possible(self, candidate: Candidate) -> World | None:
         """Return the world of a candidate; None where there is none, which is kept in mind."""
         if candidate.level in self.impossible:
@@ -277,8 +287,7 @@ class _Planning(Evidence):
 
     def refer(self) -> None:
         """Find what stands for the truth: the best level that can be piloted."""
-        facets = any(table.header["grain"]["kind"] != "sphere" for table in self.tables)
-        each = self.met() * EVENT_S[facets]
+        each = self.sample()
         able = TURN * self.budget * self.threads / max(HALVES * each, 1e-12)  # pixels
         self.looked_at = int(min(max(able, FEWEST), PIXELS))
         self.dear = able < TURN * FEWEST and bool(self.bodies)
@@ -358,9 +367,9 @@ class _Planning(Evidence):
             )
         elif self.rarer > 1.0:
             self.notes.append(
-                f"single grains meet suns by chance alone, so pilots look at suns of {WIDE:g} degrees: under smaller "
-                "ones other levels miss rather more texture than is said; candidates with single grains take "
-                f"{_digits(self.rarer)} times as long as they did in pilots, at most, and that is said"
+                f"single grains meet suns by chance alone, so pilots look at suns {self.wide:.0f} degrees wide: under "
+                "smaller ones other levels miss rather more texture than is said; what candidates with single grains "
+                f"take is said as {_digits(self.rarer)} times what it was in pilots, and may be less"
             )
 
     def finalists(self) -> list[Candidate]:
