@@ -148,6 +148,8 @@ class Evidence:
         if (missed := self.missed(plain)) is not None and size:
             size = math.hypot(missed.value, math.hypot(one.bias, 0.5 * one.bias))
             spread = max(math.log1p(missed.error / missed.value), ALIKE) if one.bias < missed.value else spread
+        elif apart is None and LEVELS[plain.level].traits.packed:  # it misses a part of the same texture
+            size = math.hypot(one.bias, one.texture * self.rougher())
         floor = beliefs.of_square(size, spread, square, error)
         if missed is not None and size:  # both are held against the same samples of the reference
             floor = floor._replace(error=max(floor.error, missed.error))
@@ -156,19 +158,34 @@ class Evidence:
     def missed(self, plain: Candidate) -> Belief | None:
         """Return the texture that all levels without single grains miss alike, by the pilot that knows it best; None
         for that, and for levels that have some of it."""
-        alike = [c for c in self.pilots if not c.explicit_grains and not LEVELS[c.level].traits.packed]
-        seen = {c: apart for c in alike if (apart := self.apart(c)) is not None}
-        if not seen or LEVELS[plain.level].traits.packed:
+        best = self.best_known()
+        if best is None or best == plain or LEVELS[plain.level].traits.packed:
             return None
-        # by the error of texture squared, not by its value: the least of several values is too small
-        best = min(seen, key=lambda c: math.hypot(seen[c].square_error, 2.0 * seen[c].bias * seen[c].bias_error))
-        if best == plain:
-            return None
-        apart, one = seen[best], self.expected[best.level]
+        return self.texture_of(best)
+
+    def texture_of(self, best: Candidate) -> Belief:
+        """Return the texture that a candidate without single grains misses, by its pilot."""
+        apart, one = self.apart(best), self.expected[best.level]
+        assert apart is not None
         floor = beliefs.of_square(one.floor, max(one.spread, 1e-9), apart.square, apart.square_error)
         off = min(abs(apart.bias), 0.9 * floor.value)
         texture = max(math.sqrt(floor.value**2 - off**2), LEAST)
         return Belief(texture, math.hypot(floor.value * floor.error, off * apart.bias_error) / texture)
+
+    def best_known(self) -> Candidate | None:
+        """Return the candidate without single grains whose pilot says most of the texture that it misses."""
+        alike = [c for c in self.pilots if not c.explicit_grains and not LEVELS[c.level].traits.packed]
+        seen = {c: apart for c in alike if (apart := self.apart(c)) is not None}
+        # by the error of texture squared, not by its value: the least of several values is too small
+        return min(
+            seen, key=lambda c: math.hypot(seen[c].square_error, 2.0 * seen[c].bias * seen[c].bias_error), default=None
+        )
+
+    def rougher(self) -> float:
+        """Return how many times as much texture the scene has as is expected, as far as that was seen."""
+        best = self.best_known()
+        expected = self.expected[best.level].texture if best is not None else 0.0
+        return self.texture_of(best).value / expected if best is not None and expected else 1.0
 
     def beside_the_reference(self, candidate: Candidate, floor: Belief) -> Belief:
         """Return a floor with what the reference itself may be off by, where that is not level explicit."""

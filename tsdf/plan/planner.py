@@ -18,8 +18,8 @@ from tsdf.picture.world import World, build
 from tsdf.plan import needs, prior
 from tsdf.plan.evidence import BOLD, BOLD_BIAS, GRAINS, MEETINGS, Evidence, singly
 from tsdf.plan.pilot import FEWEST, HALVES, PIXELS, Pilot
-from tsdf.plan.prediction import Plan, Prediction
-from tsdf.plan.report import why
+from tsdf.plan.prediction import TIE, Plan, Prediction
+from tsdf.plan.report import digits, why
 from tsdf.scene.levels import LEVELS
 from tsdf.scene.medium import Component, free_path
 from tsdf.scene.scene import Scene
@@ -33,7 +33,7 @@ TARGET = 0.02  # [1] where nothing else is asked for
 LEAST_TARGET, MOST_TARGET = 1e-4, 1.0
 SECONDS, SHARE, MOST_SECONDS = 5.0, 0.1, 20.0  # [s] of worlds and pilots; or this share of the render, up to so much
 LEAST_PILOTS = 2.0  # [s] for pilots, however long worlds take to build
-BUILDING = 0.4  # of the time, after which no more worlds are built
+BUILDING = 0.4  # of the time, after which no more worlds are built that may want records for leaps
 TURN = 0.05  # of the time, that a sample of each pixel of the reference may take
 FIRST, OF_REFERENCE = 0.35, 0.4  # shares of the time for the first round, and of a round for the reference
 OUT = 2.0  # spreads below what is expected that an error must be within reach of what is asked for
@@ -47,7 +47,6 @@ WIDE, WIDEST = 16.0, 50.0  # [deg] of suns in pilots that are smaller in the pic
 ENOUGH = 2.0  # times `MEETINGS` that they are to be met in the time that the reference has
 NEAR = 3.0  # times as long as the best as a candidate may seem to take to be looked at again
 EVENT_S = (1.0e-6, 5.0e-6)  # [s] of one explicit grain, an exact sphere and one of facets, about
-TIE = 1.1  # times as long as the cheapest as it may take, of those the one with the least error is taken
 PATIENCE = 600.0  # [s] that a picture may take where nothing is said
 BUSY = 1.5  # times as long as on processors that have nothing else to do, from which on it is said
 FEWER = 1.3  # times as large as they look in the middle, grains must look somewhere for their number to go by pixel
@@ -141,7 +140,7 @@ class _Planning(Evidence):
         self.look()
         self.refer()
         for level in self.contenders():
-            if self.spent > BUILDING * self.budget and len(self.pilots) > 2:
+            if self.deep and self.spent > BUILDING * self.budget and len(self.pilots) > 2:
                 break
             self.add(Candidate(level))
         left = max(self.budget - self.spent, LEAST_PILOTS)
@@ -295,8 +294,8 @@ class _Planning(Evidence):
             if LEVELS[level].traits.packed and self.dear:
                 if level == "explicit":
                     self.notes.append(
-                        f"light meets {self.met():.2g} grains on its way, so that level explicit cannot be piloted in "
-                        f"{self.budget:.0f} s: what others are held against is what is expected of them"
+                        f"light meets {digits(self.met())} grains on its way, so that level explicit cannot be piloted "
+                        f"in {self.budget:.0f} s: what others are held against is what is expected of them"
                     )
                     self.explicit_sample = each
                 continue
@@ -318,16 +317,20 @@ class _Planning(Evidence):
         if aimed:
             self.reference = min(aimed, key=lambda one: list(LEVELS).index(one.level))
 
+    @property
+    def deep(self) -> bool:
+        """Whether records for leaps may have to be made."""
+        return any(body.thickness > LEAPS * body.transport for body in self.bodies)
+
     def contenders(self) -> list[str]:
         """Return levels that may meet the target, those first of which most is expected."""
         order = ("teleport-memory", "volume", "teleport-packed", "teleport", "teleport-joint", "volume-hg", "isotropic")
-        deep = any(body.thickness > LEAPS * body.transport for body in self.bodies)
         found: list[str] = []
         for level in order if self.bodies else ():
             one = self.expected[level]
             reach = one.floor * math.exp(-OUT * one.spread)
             chain = LEVELS[level].traits.chains  # with explicit grains first its texture goes
-            if Candidate(level) not in self.pilots and (chain or reach < self.target or not deep):
+            if Candidate(level) not in self.pilots and (chain or reach < self.target or not self.deep):
                 found.append(level)
         if "teleport-memory" in found and all(table.memory for table in self.tables):
             found = [level for level in found if level not in ("teleport-joint",)]
@@ -369,7 +372,7 @@ class _Planning(Evidence):
             self.notes.append(
                 f"single grains meet suns by chance alone, so pilots look at suns {self.wide:.0f} degrees wide: under "
                 "smaller ones other levels miss rather more texture than is said; what candidates with single grains "
-                f"take is said as {_digits(self.rarer)} times what it was in pilots, and may be less"
+                f"take is said as {digits(self.rarer)} times what it was in pilots, and may be less"
             )
 
     def finalists(self) -> list[Candidate]:
@@ -422,8 +425,3 @@ def loaded(scene: Scene) -> tuple[Scene, list[Table]]:
             grains.append(replace(grain, table=table, mesh=mesh))
         media.append(replace(medium, grains=tuple(grains)))
     return replace(scene, media=tuple(media)), tables
-
-
-def _digits(number: float) -> str:
-    """Return a number of at least 1 with two digits."""
-    return f"{number:.2g}" if number < 99.5 else f"{float(f'{number:.2g}'):.0f}"

@@ -7,6 +7,8 @@ from tsdf.plan.beliefs import Belief
 from tsdf.scene.scene import Scene
 from tsdf.study.candidates import Candidate, taken
 
+TIE = 1.1  # times as long as the cheapest as it may take, of those the one with the least error is taken
+
 
 @dataclass(frozen=True)
 class Prediction:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tsdf.plan.prediction import Plan, Prediction
+from tsdf.plan.prediction import TIE, Plan, Prediction
 from tsdf.plan.prior import Body
 
 TARGETS = np.geomspace(0.002, 0.5, 120)  # [1] that are tried for what would change a plan's mind
@@ -34,6 +34,11 @@ def percent(value: float) -> str:
     if not math.isfinite(value):
         return "not known"
     return f"{100.0 * value:.2g} %" if abs(value) < 0.995 else f"{100.0 * value:.0f} %"
+
+
+def digits(number: float) -> str:
+    """Return a number with two digits, however large."""
+    return f"{number:.2g}" if abs(number) < 99.5 else f"{float(f'{number:.2g}'):.0f}"
 
 
 def span(seconds: float) -> str:
@@ -84,10 +89,10 @@ def _reason(plan: Plan, bodies: Sequence[Body], footprint: float, coverage: floa
     if not bodies:
         return "because there are no grains in the scene, and all levels are the same"
     body = max(bodies, key=lambda one: one.thickness)
-    seen = f"a pixel covers {footprint:.2g} R" if math.isfinite(footprint) else "no grains are seen"
-    deep = body.thickness / body.transport
-    which = f"the thickest of {len(bodies)} media has " if len(bodies) > 1 else ""
-    where = f"{seen}, {which}f = {body.packing_fraction:g}, {body.thickness:.2g} R or {deep:.2g} l* thick"
+    seen = f"a pixel covers {footprint:.2g} R of grains" if math.isfinite(footprint) else "it sees no grains,"
+    thick = f"{digits(body.thickness)} R or {digits(body.thickness / body.transport)} transport lengths"
+    which = f" in the thickest of {len(bodies)} media" if len(bodies) > 1 else ""
+    where = f"{seen} that fill {100.0 * body.packing_fraction:.3g} % of {thick}{which}"
     turn = chosen.variance * chosen.turn
     worse = [p for p in plan.predictions[1:] if p.variance * p.turn < turn and p.floor.high > 0.0]
     nearest = min(worse, key=lambda p: p.floor.value, default=None)
@@ -108,10 +113,11 @@ def _other(plan: Plan) -> str:
     flips = {}
     for target in TARGETS:
         best = min(plan.predictions, key=lambda p: p.safe_seconds(float(target)))
-        if math.isfinite(best.safe_seconds(float(target))):
+        takes = best.safe_seconds(float(target))
+        if math.isfinite(takes) and chosen.safe_seconds(float(target)) > TIE * takes:
             flips[float(target)] = best
-    lower = [t for t, p in flips.items() if OTHER * t < plan.target and p is not chosen]
-    upper = [t for t, p in flips.items() if t > OTHER * plan.target and p is not chosen]
+    lower = [t for t in flips if OTHER * t < plan.target]
+    upper = [t for t in flips if t > OTHER * plan.target]
     changes = []
     if lower:
         changes.append(f"a target below {percent(max(lower))} ({flips[max(lower)].candidate})")
