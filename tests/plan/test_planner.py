@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import tsdf
+from tsdf.data import library
 from tsdf.errors import SceneError, UsageError
 from tsdf.picture import render, world
 from tsdf.plan import evidence, planner, report, shot
@@ -121,7 +122,7 @@ def test_other_wishes_other_choices(far: Plan, ball: tsdf.Table) -> None:
     assert p.noise(4.0) == pytest.approx(0.5 * p.noise(1.0)) and p.error(p.seconds(0.03)) == pytest.approx(0.03)
     hurried = plan(pile(ball, 160.0), 0.002, seconds=0.5, threads=2)
     assert "least" in hurried.why[0]
-    errors = [math.hypot(p.floor.high, p.noise(0.5 / hurried.load)) for p in hurried.predictions]
+    errors = [math.hypot(p.floor.value, p.floor.error, p.noise(0.5 / hurried.load)) for p in hurried.predictions]
     assert errors[0] == min(errors)
 
 
@@ -167,6 +168,24 @@ def test_what_single_grains_take_under_a_small_sun(ball: tsdf.Table) -> None:
     picture = render.render(world.build(scene, "explicit"), spp=2000, seed=3, threads=2)
     found = 2000 * float(picture.variance.mean()) / float(picture.rgb.mean()) ** 2
     assert 0.7 < said.variance / found < 2.0
+
+
+def test_light_that_goes_straight_on_finds_suns_by_chance() -> None:
+    """Cubes let much of the light through parallel facets exactly straight on, along which no level aims: its variance
+    grows as a sun shrinks, but for levels that know no such light. What is said of a sun of 4 degrees, by pilots of
+    a wider one, is about what a pilot of it sees; that of the lobe stays."""
+    table = tsdf.read(library.ready("salt"))
+    scene = replace(pile(table, 60.0), lights=(replace(SUN, angular_diameter_deg=4.0), ConstantLight((0.3,) * 3)))
+    made = plan(scene, 0.2, threads=2)
+    for level, grows in (("volume", True), ("volume-hg", False)):
+        pilot = Pilot(world.build(scene, level), 7, 2, 400)
+        pilot.run(1.0)
+        wide = Pilot(
+            world.build(replace(scene, lights=(replace(SUN, angular_diameter_deg=16.0), scene.lights[1])), level), 7
+        )
+        wide.run(0.2)
+        assert (pilot.seen.variance > 3.0 * wide.seen.variance) == grows
+        assert of(made, level).variance == pytest.approx(pilot.seen.variance, rel=0.6)
 
 
 def test_where_there_is_nothing_to_see(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:

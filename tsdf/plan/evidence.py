@@ -48,6 +48,8 @@ class Evidence:
         Kurtosis of lights that single grains meet by chance, 0 where there are none.
     rarer : float
         How many times as seldom they are met in the picture as in pilots, whose suns are wider.
+    atoms : float
+        Share of the light that grains let go exactly straight on or send exactly back.
     explicit_sample : float
         Time of a sample at level explicit of one thread, where that is not piloted [s].
     """
@@ -61,7 +63,7 @@ class Evidence:
         self.impossible: dict[str, TSDFError] = {}
         self.refused: set[Candidate] = set()
         self.footprint, self.coverage, self.ratio, self.far = math.inf, 0.0, 1.0, False
-        self.chance, self.rarer = 0.0, 1.0
+        self.chance, self.rarer, self.atoms = 0.0, 1.0, 0.0
         self.explicit_sample = math.inf
 
     def predictions(self) -> list[Prediction]:
@@ -241,10 +243,21 @@ class Evidence:
         return max(self.pilots[self.reference].seen.events / max(self.coverage, 1e-9), 1.0)
 
     def cost(self, candidate: Candidate) -> tuple[Seen, bool]:
-        """Return variance and time of a sample, by its pilot or from those of others, and whether it was the former;
-        suns that only chance finds make as much more of it as they are smaller than in pilots, at most."""
+        """Return variance and time of a sample, by its pilot or from those of others, and whether it was the former.
+
+        Suns that only chance finds make as much more of the variance as they are smaller than in pilots: all of it, at
+        most, of single grains, and of levels whose grains let a share of light go exactly straight on, along which
+        nothing is aimed, that share of it.
+        """
         seen, piloted = self.cost_of_pilots(candidate)
-        return seen._replace(variance=seen.variance * (self.rarer if singly(candidate) else 1.0)), piloted
+        found = seen.variance
+        if not singly(candidate):
+            explicit = self.pilots.get(Candidate("explicit"))
+            all_of_it = self.of_reference(explicit).variance if explicit is not None and explicit.each else math.inf
+            straight = 0.0 if LEVELS[candidate.level].traits.points or not self.atoms else self.atoms * all_of_it
+            found = min(found, straight)
+        more = (self.rarer - 1.0) * found if self.rarer > 1.0 else 0.0
+        return seen._replace(variance=seen.variance + more), piloted
 
     def cost_of_pilots(self, candidate: Candidate) -> tuple[Seen, bool]:
         """Return the same of the lights that pilots are under."""

@@ -210,6 +210,7 @@ class _Planning(Evidence):
         self.far = self.ratio > FEWER
         if world.lights.sampled and self.bodies:
             self.chance = kurtosis_of(world.lights)
+            self.atoms = max(float(table.p_theta[0] + table.p_theta[-1]) for table in self.tables)
             self.widen()
         self.expected = {level: self.foreseen(level) for level in LEVELS}
         if not all(one.known for one in self.expected.values()):
@@ -403,7 +404,7 @@ class _Planning(Evidence):
         takes = best.safe_seconds(self.target)
         limit = self.limit / self.load
         if not takes <= limit and math.isfinite(limit):
-            return min(found, key=lambda p: math.hypot(p.floor.high, p.noise(limit)))
+            return min(found, key=lambda p: p.likely_error(limit))
         if math.isinf(takes):
             return min(found, key=lambda p: p.floor.high)
         alike = [p for p in found if p.safe_seconds(self.target) <= TIE * takes]

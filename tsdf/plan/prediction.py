@@ -50,6 +50,10 @@ class Prediction:
         """Return the whole error after so long [s]."""
         return math.hypot(self.floor.value, self.noise(seconds))
 
+    def likely_error(self, seconds: float) -> float:
+        """Return the root mean square of the whole error after so long [s], over what the floor may be."""
+        return math.hypot(self.error(seconds), self.floor.error)
+
     def seconds(self, target: float, floor: float | None = None) -> float:
         """Return the time to an error [s], infinite where it is out of reach; `floor` instead of what is believed."""
         left = target**2 - (self.floor.value if floor is None else floor) ** 2

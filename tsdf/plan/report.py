@@ -133,7 +133,7 @@ def _other(plan: Plan) -> str:
 def _short_of_time(plan: Plan, able: float) -> str:
     assert plan.seconds is not None
     known = [p for p in plan.predictions[1:] if math.isfinite(p.variance)] or plan.predictions[1:]
-    second = min(known, key=lambda p: p.error(able))
+    second = min(known, key=lambda p: p.likely_error(able))
     runner = f"runner-up: {second.candidate}, an error of {percent(second.error(able))} then"
     best = min(plan.predictions, key=lambda p: p.safe_seconds(plan.target))
     takes = best.safe_seconds(plan.target) * plan.load
