@@ -1,8 +1,8 @@
 """Scenes that plans are judged by, none of which anything was fitted to: grains of radius 1, 48 by 36 pixels.
 
 In sets, by when they were written: those without a mark showed what was wrong in principle; + were held out until the
-laws of texture stood, ++ until error bars did; +++ are a sceptic's, unlike the others, and ++++ were written when
-nothing of a plan was changed any more.
+laws of texture stood, ++ until error bars did; +++ are a sceptic's, unlike the others; ++++ were written when what
+those showed was mended, and +++++ when nothing of a plan was changed any more.
 """
 
 from collections.abc import Iterator
@@ -97,6 +97,7 @@ def scenes(folder: Path) -> Iterator[tuple[str, dict[str, Any], tuple[float, flo
     # fmt: on
     yield from sceptical(folder)
     yield from last(folder)
+    yield from afterwards(folder)
 
 
 def moved(medium: dict[str, Any], x: float, y: float = 0.0, z: float = 0.0) -> dict[str, Any]:
@@ -210,4 +211,24 @@ def last(folder: Path) -> Iterator[tuple[str, dict[str, Any], tuple[float, float
     sunny = made(ball(25), [fresh], 0.3, [SKY, SMALL_SUN], 500, 150, 25, 8, True)
     yield "++++fresh snow in the sun", sunny, (0.05, 0.1)
     yield "++++dust", scaled(made(ball(20), [snow, sand], 0.15, [SKY, NOON], 110, 40, 20, 28), 1e-5), (0.03, 0.08)
+    # fmt: on
+
+
+def afterwards(folder: Path) -> Iterator[tuple[str, dict[str, Any], tuple[float, float]]]:
+    """Yield the set +++++."""
+    glass, salt, sand = (grain(name) for name in ("glass-beads", "salt", "sand"))
+    quartz, snow, plates = (grain(name) for name in ("quartz", "coarse-snow", "plates"))
+    brown, dark, some = grain("sugar", [0.03, 0.08, 0.2]), grain("sand", 0.4), grain("glass-beads", 0.0, 0.5)
+    blue = {"type": "environment", "file": str(ROOT / "scenes" / "assets" / "blue_sky.exr")}
+    noon = {**NOON, "angular_diameter_deg": 30.0}
+    # fmt: off
+    yield "+++++salt in the sun", made(box(90, 90, 16), [salt], 0.5, [SKY, SMALL_SUN], 300, 240, 6, 22), (0.05, 0.1)
+    yield "+++++glass in snow", made(ball(16), [snow, some], 0.4, [SKY, noon], 90, 30, 16, 26), (0.04, 0.1)
+    yield "+++++sugar cube", made(box(12, 12, 12), [brown], 0.55, [SKY, noon], 40, 30, 6, 32, True), (0.05, 0.12)
+    veil = made({"type": "slab", "low": 0.02, "high": 20}, [quartz], 0.1, [SKY, noon], 60, 70, 10, 45)
+    yield "+++++veil", {**veil, "surface": [FLOOR]}, (0.03, 0.08)
+    yield "+++++dark sand", made(box(60, 60, 20), [dark], 0.6, [WHITE], 120, 120, 10), (0.02, 0.06)
+    yield "+++++pane", made(box(50, 6, 50), [glass], 0.35, [SKY, BEHIND], 90, 30, 25, inside="centres"), (0.04, 0.1)
+    yield "+++++plates at noon", made(ball(30), [plates], 0.25, [blue, noon], 160, 60, 30, 28), (0.03, 0.1)
+    yield "+++++sand on end", made(box(16, 16, 60), [sand], 0.5, [SKY, LOW_SUN], 130, 40, 30, 40, True), (0.04, 0.1)
     # fmt: on
