@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -366,3 +367,24 @@ def test_bias_falls_with_the_grains_that_are_left_to_a_level(ball: tsdf.Table, m
     monkeypatch.setattr(planner._Planning, "apart", lambda _, candidate: apart.get(candidate))
     assert run.predicted(Candidate("teleport", 8)).bias == pytest.approx(0.003, rel=0.1)
     assert abs(run.predicted(Candidate("teleport", 16)).bias) < 0.0031
+
+
+def test_bolder_leaps_are_looked_at_where_they_may_win(far: Plan, ball: tsdf.Table) -> None:
+    """At the level whose events are dear, where there are leaps, nobody has named any, and the error would still do;
+    what is taken is rendered so, and the options that fix it say so."""
+    run = planner._Planning(pile(ball, 160.0), 0.05, None, 0, 2)
+    chosen = replace(of(far, "teleport-memory"), floor=Belief(0.02, 0.005))
+    run.pilots[chosen.candidate] = SimpleNamespace(world=SimpleNamespace(leap=2.0))
+    bold = run.bolder_of(chosen)
+    assert bold == Candidate("teleport-memory", 0, evidence.BOLD) and str(bold) == "teleport-memory leap=1"
+    assert run.bolder_of(replace(chosen, floor=Belief(0.0497, 0.0))) is None
+    run.pilots[Candidate("volume")] = run.pilots[chosen.candidate]
+    assert run.bolder_of(replace(chosen, candidate=Candidate("volume"))) is None
+    run.pilots[chosen.candidate] = SimpleNamespace(world=SimpleNamespace(leap=0.0))
+    assert run.bolder_of(chosen) is None
+    made = replace(far, predictions=(replace(chosen, candidate=bold), *far.predictions))
+    assert made.planned.render.leap == 1.0 and report.options(made) == "--level teleport-memory --leap 1"
+    assert report.chosen_facts(made)["leap"] == 1.0
+    run.reference = chosen.candidate
+    bias_error, floor = run.bolder(bold, 0.001, chosen.floor)
+    assert bias_error > evidence.BOLD_BIAS and floor.value > chosen.floor.value and floor.error >= chosen.floor.error
