@@ -388,3 +388,23 @@ def test_bolder_leaps_are_looked_at_where_they_may_win(far: Plan, ball: tsdf.Tab
     run.reference = chosen.candidate
     bias_error, floor = run.bolder(bold, 0.001, chosen.floor)
     assert bias_error > evidence.BOLD_BIAS and floor.value > chosen.floor.value and floor.error >= chosen.floor.error
+
+
+def test_flat_facets_sparkle_under_small_suns(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The square of what cubes miss under a sun of 8 degrees is what pilots of a wider one see times how much more of
+    the sky that takes; a sphere's stays. (A picture of cubes in the sun of bench_plan says so, too.)"""
+    for table, flat in ((ball, False), (tsdf.read(library.ready("salt")), True)):
+        scene = replace(pile(table, 120.0), lights=(replace(SUN, angular_diameter_deg=8.0),))
+        run = planner._Planning(scene, 0.1, None, 0, 2)
+        run.look()
+        more = (run.wide / 8.0) ** 2 if flat else 1.0
+        assert run.sparkle == pytest.approx(more, rel=0.05) and (more > 3.0) == flat
+        run.refer()
+        assert run.add(Candidate("volume"))
+        for pilot in run.pilots.values():
+            pilot.each = 1
+        monkeypatch.setattr(planner._Planning, "trusted", lambda *_: True)
+        monkeypatch.setattr(Pilot, "apart", lambda *_: Apart(0.01, 0.001, 0.2, 0.1))
+        seen = run.apart(Candidate("volume"))
+        assert seen is not None and seen.bias == 0.01
+        assert (seen.square, seen.square_error) == pytest.approx((0.2 * more, 0.1 * more), rel=0.05)

@@ -24,6 +24,7 @@ ALIKE = 0.2  # of the logarithm of an error, what two levels of teleportation ma
 LEAST = 1e-4  # [1] of an error
 UNSURE = 0.8  # of the logarithm of texture, what that law may be off by for other grains than spheres
 FADING = 0.3  # of the logarithm of texture, what that law may be off by; and of what is left of a bias
+FLAT = 0.1  # share of light that goes straight on from which on grains are flat all over
 BOLD = 1.0  # [l*] least radius of leaps that are bolder than they are by default
 BOLD_BIAS = 0.006  # [1] that they may be off by (docs/leaps.md)
 
@@ -83,18 +84,18 @@ class Evidence:
             return False
         return not (self.chance and pilot.world.media.singles) or self.often(pilot)
 
-    def often(self, pilot: Pilot) -> bool:
-        """Return whether so many samples as a pilot has are enough for lights that are met by chance alone."""
-        return not self.chance or pilot.seen.samples * self.coverage / self.chance > MEETINGS
+    def often(self, pilot: Pilot, share: float = 1.0) -> bool:
+        """Return whether a pilot has samples enough for lights that chance finds, or a share of enough."""
+        return not self.chance or pilot.seen.samples * self.coverage / self.chance > share * MEETINGS
 
     def hidden(self, candidate: Candidate) -> bool:
         """Return whether a candidate's single grains meet lights too seldom for its variance to be known: by the pilot
-        of the reference, if that has single grains, or else by its own or one of as many samples as the reference's."""
+        of level explicit or the reference, if that has single grains, or else by its own or one of as many samples."""
         assert self.reference is not None
         if not singly(candidate):
             return False
-        best = self.pilots[self.reference]
-        return not self.often(best if singly(self.reference) else self.pilots.get(candidate, best))
+        best = self.pilots.get(Candidate("explicit"), self.pilots[self.reference])
+        return not self.often(best if best.world.media.singles else self.pilots.get(candidate, best))
 
     def apart(self, candidate: Candidate) -> Apart | None:
         """Return how a candidate differs from the reference as far as that is known."""
@@ -104,7 +105,14 @@ class Evidence:
             return None
         if not self.trusted(own) or not self.trusted(other):
             return None
-        return own.apart(other)
+        seen, more = own.apart(other), self.sparkle
+        return Apart(seen.bias, math.sqrt(more) * seen.bias_error, more * seen.square, more * seen.square_error)
+
+    @property
+    def sparkle(self) -> float:
+        """How many times as much the square of texture is under the suns of the picture as under those of pilots: flat
+        facets mirror a smaller sun as much more seldom as it is brighter, curved ones make a small image of any."""
+        return 1.0 + (self.rarer - 1.0) * min(self.atoms / FLAT, 1.0)
 
     def predicted(self, candidate: Candidate) -> Prediction:
         """Return what is predicted of a candidate."""
@@ -190,12 +198,14 @@ class Evidence:
         return self.texture_of(best).value / expected if best is not None and expected else 1.0
 
     def beside_the_reference(self, candidate: Candidate, floor: Belief) -> Belief:
-        """Return a floor with what the reference itself may be off by, where that is not level explicit."""
+        """Return a floor with what the reference itself may be off by, where that is not level explicit; with explicit
+        grains first there is less of it."""
         assert self.reference is not None
         if self.reference.level == "explicit" or candidate.level == "explicit":
             return floor
         own = self.expected[self.reference.level]
         off = beliefs.of_square(own.floor, max(own.spread, 1e-9))
+        off = self.faded(own, 0.0, own.bias, off, 0, candidate.explicit_grains)[2]
         if candidate.level == self.reference.level:
             return off
         return Belief(math.hypot(floor.value, off.value), math.hypot(floor.error, off.error))

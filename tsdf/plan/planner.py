@@ -44,6 +44,7 @@ CHECK = 0.15  # of what is left for pilots, for looks at what is chosen and was 
 BRIEF, MOST_CHECKS = 0.3, 3  # [s] that such a look takes at least, and how many there are at most
 WIDE, WIDEST = 16.0, 50.0  # [deg] of suns in pilots that are smaller in the picture, which single grains would hardly
 # ever meet, at least and at most
+SOON = 0.5  # of `MEETINGS`, after the first round, that there will be enough of after the second
 ENOUGH = 2.0  # times `MEETINGS` that they are to be met in the time that the reference has
 NEAR = 3.0  # times as long as the best as a candidate may seem to take to be looked at again
 EVENT_S = (1.0e-6, 5.0e-6)  # [s] of one explicit grain, an exact sphere and one of facets, about
@@ -146,8 +147,9 @@ class _Planning(Evidence):
         left = max(self.budget - self.spent, LEAST_PILOTS)
         self.ends = self.spent + left
         self.round(FIRST * left, list(self.pilots))
-        self.refer_anew()
+        self.refer_anew(SOON)
         self.round((1.0 - FIRST - CHECK) * left, self.finalists())
+        self.refer_anew()
         self.weigh()
         chosen, found = self.settled()
         rest = sorted((p for p in found if p is not chosen), key=lambda p: (p.safe_seconds(self.target), p.floor.value))
@@ -242,7 +244,8 @@ class _Planning(Evidence):
         if not self.bodies or not self.coverage:
             return prior.Expected(0.0, 0.0, 0.0, True)
         each = [prior.expected(level, body, self.footprint, self.coverage) for body in self.bodies]
-        return max(each, key=lambda one: one.floor)
+        most = max(each, key=lambda one: one.floor)
+        return most._replace(texture=math.sqrt(self.sparkle) * most.texture)
 
     def met(self) -> float:
         """Return about how many explicit grains a sample meets."""
@@ -308,11 +311,12 @@ class _Planning(Evidence):
         if self.reference.level != "explicit" and "explicit" in self.impossible:
             self.notes.append(f"no level explicit here, {self.reference} stands for it: {self.impossible['explicit']}")
 
-    def refer_anew(self) -> None:
-        """Hold levels against the best that aims at lights, where the pilot of the best has met them too seldom."""
+    def refer_anew(self, share: float = 1.0) -> None:
+        """Hold levels against the best that aims at lights, where the pilot of the best has met them too seldom, or
+        less often than a share of that."""
         assert self.reference is not None
         best = self.pilots[self.reference]
-        if self.trusted(best) or not self.chance:
+        if self.trusted(best) or not self.chance or self.often(best, share):
             return
         aimed = [one for one in self.pilots if not singly(one) and self.trusted(self.pilots[one])]
         if aimed:
@@ -374,6 +378,8 @@ class _Planning(Evidence):
                 f"single grains meet suns by chance alone, so pilots look at suns {self.wide:.0f} degrees wide: under "
                 "smaller ones other levels miss rather more texture than is said; what candidates with single grains "
                 f"take is said as {digits(self.rarer)} times what it was in pilots, and may be less"
+                + "; flat facets sparkle, the more the smaller the sun, and that is in what is missed"
+                * (self.sparkle > 2.0)
             )
 
     def finalists(self) -> list[Candidate]:
