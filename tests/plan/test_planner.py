@@ -347,7 +347,7 @@ def test_noise_is_over_the_true_mean(ball: tsdf.Table) -> None:
 
 
 def test_bias_falls_with_the_grains_that_are_left_to_a_level(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With as many explicit grains as light meets in the mean a bias that all packings share is down by e, in a deep
+    """Of a bias that all packings share as much is left as there is light that meets more grains yet, in a deep
     medium it stays; what one packing differs by falls as its texture does. A pilot with some has the last word."""
     run = planner._Planning(pile(ball, 160.0), 0.05, None, 0, 2)
     run.look()
@@ -355,7 +355,7 @@ def test_bias_falls_with_the_grains_that_are_left_to_a_level(ball: tsdf.Table, m
     one, whole = run.expected["teleport"], Belief(0.1, 0.0)
     monkeypatch.setattr(planner._Planning, "length", 8.0)
     monkeypatch.setattr(planner._Planning, "of_one_packing", lambda *_: 0.0)
-    assert run.faded(one, 0.02, 0.0, whole, 0, 8)[0] == pytest.approx(0.02 / math.e)
+    assert run.faded(one, 0.02, 0.0, whole, 0, 8)[0] == pytest.approx(0.02 * (7.0 / 8.0) ** 8)
     monkeypatch.setattr(planner._Planning, "length", 800.0)
     assert run.faded(one, 0.02, 0.0, whole, 0, 8)[0] == pytest.approx(0.02, rel=0.02)
     monkeypatch.setattr(planner._Planning, "of_one_packing", lambda *_: 1e3)
@@ -408,3 +408,18 @@ def test_flat_facets_sparkle_under_small_suns(ball: tsdf.Table, monkeypatch: pyt
         seen = run.apart(Candidate("volume"))
         assert seen is not None and seen.bias == 0.01
         assert (seen.square, seen.square_error) == pytest.approx((0.2 * more, 0.1 * more), rel=0.05)
+
+
+def test_what_chains_miss_after_explicit_grains_is_alike(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pilot of one chain with three explicit grains first tells of others with three, less surely; not of none."""
+    run = planner._Planning(pile(ball, 160.0), 0.05, None, 0, 2)
+    run.look()
+    run.refer()
+    before = [run.predicted(Candidate("teleport-memory", k)).floor for k in (0, 3)]
+    one = Candidate("teleport", 3)
+    assert run.add(one)
+    monkeypatch.setattr(planner._Planning, "apart", lambda _, c: Apart(0.0, 1e-4, 1e-4, 1e-6) if c == one else None)
+    own, other = run.predicted(one).floor, run.predicted(Candidate("teleport-memory", 3)).floor
+    assert own.value == pytest.approx(0.01, rel=0.1) and other.value == pytest.approx(0.01, rel=0.3)
+    assert before[1].value < 0.3 * other.value and other.error > own.error
+    assert run.predicted(Candidate("teleport-memory")).floor == before[0]

@@ -122,11 +122,19 @@ class Evidence:
         bias, bias_error, floor, known = self.without(plain, one)
         base = 0
         for fewer in GRAINS[1:]:  # what is seen of fewer explicit grains says more of this number than none does
-            if fewer <= k and (later := self.apart(Candidate(level, fewer))) is not None:
-                bias, bias_error, floor = self.faded(one, bias, bias_error, floor, base, fewer)
+            later = self.apart(Candidate(level, fewer)) if fewer <= k else None
+            alike = self.seen_after(fewer) if fewer <= k else None  # what other chains miss then
+            if later is None and alike is None:
+                continue
+            bias, bias_error, floor = self.faded(one, bias, bias_error, floor, base, fewer)
+            if later is not None:
                 floor = beliefs.of_square(max(floor.value, LEAST), UNSURE, later.square, later.square_error)
                 bias, bias_error = beliefs.of_bias(max(bias_error, LEAST), later.bias, later.bias_error, bias)
-                base, known = fewer, True
+            elif alike is not None:
+                square = alike.square - alike.bias**2 + bias**2
+                floor = beliefs.of_square(max(floor.value, LEAST), UNSURE, square, alike.square_error)
+                floor = floor._replace(error=math.hypot(floor.error, ALIKE * floor.value))
+            base, known = fewer, True
         bias, bias_error, floor = self.faded(one, bias, bias_error, floor, base, k)
         if candidate.leap is not None:
             bias_error, floor = self.bolder(candidate, bias_error, floor)
@@ -137,6 +145,12 @@ class Evidence:
         return Prediction(
             candidate, bias, bias_error, texture, most - texture, floor, seen.variance, turn, piloted, known,
         )  # fmt: skip
+
+    def seen_after(self, k: int) -> Apart | None:
+        """Return what pilots of chains with so many explicit grains first saw, by the one that knows it best: all miss
+        the same texture."""
+        seen = [self.apart(one) for one in self.pilots if one.explicit_grains == k and one.leap is None]
+        return min((one for one in seen if one is not None), key=lambda one: one.square_error, default=None)
 
     def bolder(self, candidate: Candidate, bias_error: float, floor: Belief) -> tuple[float, Belief]:
         """Return the error of a bias and a floor with what bolder leaps may add, and what their pilot saw of it."""
@@ -228,10 +242,10 @@ class Evidence:
         if k == before:
             return bias, bias_error, floor
         off = min(math.hypot(bias, bias_error), floor.value)
-        left = math.exp((before - k) / min(self.per_e, self.length))
+        left = math.exp((before - k) * max(1.0 / self.per_e, self.lasting))
         if self.far and not before:
             left = min(1.0, self.ratio * left)
-        packing, alike = self.of_one_packing(one), math.exp((before - k) / self.length)
+        packing, alike = self.of_one_packing(one), math.exp((before - k) * self.lasting)
         share = one.bias**2 / max(one.bias**2 + packing**2, 1e-30)
         less = math.sqrt(share * alike**2 + (1.0 - share) * left**2)
         bias, bias_error = bias * less, math.hypot(bias_error, FADING * bias) * less
@@ -251,6 +265,12 @@ class Evidence:
         """How many grains light meets that meets any, by the reference: with fewer still to come less can be missed."""
         assert self.reference is not None
         return max(self.pilots[self.reference].seen.events / max(self.coverage, 1e-9), 1.0)
+
+    @property
+    def lasting(self) -> float:
+        """How much of the light that has met any number of grains meets none any more, as a logarithm, if each may be
+        the last alike."""
+        return -math.log1p(-1.0 / max(self.length, 1.05))
 
     def cost(self, candidate: Candidate) -> tuple[Seen, bool]:
         """Return variance and time of a sample, by its pilot or from those of others, and whether it was the former.

@@ -168,9 +168,9 @@ class _Planning(Evidence):
 
     def settled(self) -> tuple[Prediction, list[Prediction]]:
         """Return what is chosen, which a pilot has seen where one can, and all predictions."""
-        for _ in range(MOST_CHECKS):
+        for looks in range(MOST_CHECKS):
             one = self.choose(self.predictions()).candidate
-            if one in self.pilots:
+            if one in self.pilots or (looks and self.spent > self.ends):
                 break
             if self.dear and LEVELS[one.level].traits.packed:
                 if self.possible(one) is not None:
