@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from queue import SimpleQueue
 
 from tsdf.files import need_memory
-from tsdf.grain.grains import Grain
+from tsdf.grain.grains import Grain, embree_scene
 from tsdf.grain.optics import Optics
 from tsdf.make import tally as T
 from tsdf.make.tally import Tally
@@ -63,11 +63,15 @@ class Crew:
         self._sides = [[Tally(joint, memory) for _ in range(threads)] for _ in range(2)]
         first = self._sides[0][0]
         need_memory(threads * (THREAD_BYTES + 2 * sum(counts.nbytes for counts in first.arrays().values())))
+        scene = None if grain.kind == "sphere" else embree_scene(grain)  # one for all, which takes a while to make
         self._tracers = [
-            Tracer(grain, optics.eta, optics.fresnel, seed, max_bounces, reflectance_scale=reflectance_scale)
+            Tracer(
+                grain, optics.eta, optics.fresnel, seed, max_bounces, reflectance_scale=reflectance_scale, scene=scene
+            )
             for _ in range(threads)
         ]
-        self._tracers[0].trace(in_order(0, T.REPLICATES), first)  # compiles what is not compiled yet
+        # compiles what is not compiled yet, and has the ray engine make its tree before others ask it
+        self._tracers[0].trace(in_order(0, T.REPLICATES), first)
         first.clear()
         self._idle: SimpleQueue[int] = SimpleQueue()
         for worker in range(threads):

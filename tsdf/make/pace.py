@@ -40,7 +40,7 @@ class Pace:
         """Take note of how long a round took."""
         self.rate = paths / max(seconds, 1e-6)
         if paths == self.length and seconds < 0.5 * ROUND_S:
-            self.length *= 2
+            self.length *= 2 if seconds > 0.125 * ROUND_S else 8
 
 
 @dataclass

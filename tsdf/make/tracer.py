@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Event, Lock, Thread
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,7 +35,7 @@ from tsdf.vectors import KERNEL, dot, frame, minus, renewed, step, triple
 SPLIT = 0.6  # a part lighter than this share of the light that enters is raised to it at random
 FAN = 4  # directions in which a facet is lit from one point, half as many in a grain that shades itself
 OPEN = 0.9  # share of the light that comes in above the horizon of a grain that does not
-SLOTS = 2048  # rays under way at once, per thread, but for splitting: their state stays in the second-level cache
+SLOTS = 4096  # rays under way at once, per thread, but for splitting: few enough for the cache, a millisecond of work
 MAX_BOUNCES = 100_000  # default bounce limit
 # A ray under way: where it starts and goes, the length inside so far, the light that entered, its random key and path,
 # the facet it starts from, hits so far
@@ -356,6 +356,8 @@ class Tracer:
         Independent random numbers and one way at each hit: the textbook estimator, for comparison.
     reflectance_scale : float
         Factor on every partial reflectance; other than 1 it makes a wrong tracer, to test the tests.
+    scene : EmbreeScene, optional
+        Of the grain, to share; one of its own by default. Whoever uses it first must have done so before another asks.
     """
 
     grain: Grain
@@ -366,13 +368,14 @@ class Tracer:
     plain: bool = False
     reflectance_scale: float = 1.0
     slots: int = SLOTS
+    scene: Any = None
     log: Callable[[np.ndarray, np.ndarray], None] | None = None
 
     def __post_init__(self) -> None:
         planes, centroids, horizon, share = surface_of(self.grain, self.plain)
         self._sphere = self.grain.kind == "sphere"
         if not self._sphere:
-            self._scene = embree_scene(self.grain)
+            self._scene = self.scene or embree_scene(self.grain)
         self._fan = 1 if self.plain else FAN if share > OPEN else FAN // 2
         self._task = Handle(
             Task(
