@@ -124,7 +124,7 @@ def test_other_wishes_other_choices(far: Plan, ball: tsdf.Table) -> None:
     hurried = plan(pile(ball, 160.0), 0.002, seconds=0.5, threads=2)
     assert "least" in hurried.why[0]
     errors = [math.hypot(p.floor.value, p.floor.error, p.noise(0.5 / hurried.load)) for p in hurried.predictions]
-    assert errors[0] == min(errors)
+    assert errors[0] <= planner.TIE * min(errors)
 
 
 def test_only_the_camera_matters_to_scenes_without_grains() -> None:

@@ -106,7 +106,7 @@ class Evidence:
         if not self.trusted(own) or not self.trusted(other):
             return None
         seen, more = own.apart(other), self.sparkle
-        return Apart(seen.bias, math.sqrt(more) * seen.bias_error, more * seen.square, more * seen.square_error)
+        return seen._replace(square=more * seen.square, square_error=more * seen.square_error)
 
     @property
     def sparkle(self) -> float:

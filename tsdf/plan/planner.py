@@ -45,7 +45,7 @@ BRIEF, MOST_CHECKS = 0.3, 3  # [s] that such a look takes at least, and how many
 WIDE, WIDEST = 16.0, 50.0  # [deg] of suns in pilots that are smaller in the picture, which single grains would hardly
 # ever meet, at least and at most
 SOON = 0.5  # of `MEETINGS`, after the first round, that there will be enough of after the second
-ENOUGH = 2.0  # times `MEETINGS` that they are to be met in the time that the reference has
+ENOUGH = 4.0  # times `MEETINGS` that they are to be met in the time that the reference has
 NEAR = 3.0  # times as long as the best as a candidate may seem to take to be looked at again
 EVENT_S = (1.0e-6, 5.0e-6)  # [s] of one explicit grain, an exact sphere and one of facets, about
 PATIENCE = 600.0  # [s] that a picture may take where nothing is said
@@ -401,7 +401,8 @@ class _Planning(Evidence):
 
     def choose(self, found: list[Prediction]) -> Prediction:
         """Return the cheapest that is sure enough to meet the target; if there is a time and none does, the one with
-        the least error in it. None is taken of whose noise nothing is known, unless nothing is of any."""
+        the least error in it, of those that aim at small suns. None is taken of whose noise nothing is known, unless
+        nothing is of any."""
         found = [p for p in found if math.isfinite(p.variance)] or found
         if self.spp is not None:
             fit = [p for p in found if p.floor.high < self.target]
@@ -410,7 +411,11 @@ class _Planning(Evidence):
         takes = best.safe_seconds(self.target)
         limit = self.limit / self.load
         if not takes <= limit and math.isfinite(limit):
-            return min(found, key=lambda p: p.likely_error(limit))
+            # sparkle that is not rendered to the end is nothing but noise; and what all miss tells none from the others
+            aimed = [p for p in found if not (self.rarer > 1.0 and singly(p.candidate))] or found
+            least = min(p.likely_error(limit) for p in aimed)
+            alike = [p for p in aimed if p.likely_error(limit) <= TIE * least]
+            return min(alike, key=lambda p: math.hypot(p.bias, p.bias_error, p.noise(limit)))
         if math.isinf(takes):
             return min(found, key=lambda p: p.floor.high)
         alike = [p for p in found if p.safe_seconds(self.target) <= TIE * takes]

@@ -72,6 +72,9 @@ def _first(plan: Plan) -> str:
     elif plan.seconds is not None and plan.able is not None:
         after = f"an error of {percent(p.error(plan.able))} after {span(plan.seconds)}"
         met = f"none is sure to meet {percent(plan.target)} in that time, and this one has least"
+        able = plan.able
+        if min(one.likely_error(able) for one in plan.predictions) * TIE < p.likely_error(able):
+            met += " of those that aim at lights"
         if takes <= plan.able:
             met = f"{percent(plan.target)} after {_about(takes)}"
     elif math.isinf(takes):
