@@ -2,7 +2,7 @@
 
 In sets, by when they were written: those without a mark showed what was wrong in principle; + were held out until the
 laws of texture stood, ++ until error bars did; +++ are a sceptic's, unlike the others; ++++ were written when what
-those showed was mended, and +++++ when nothing of a plan was changed any more.
+those showed was mended, +++++ before the last that these showed was, ++++++ after it.
 """
 
 from collections.abc import Iterator
@@ -98,6 +98,7 @@ def scenes(folder: Path) -> Iterator[tuple[str, dict[str, Any], tuple[float, flo
     yield from sceptical(folder)
     yield from last(folder)
     yield from afterwards(folder)
+    yield from at_last(folder)
 
 
 def moved(medium: dict[str, Any], x: float, y: float = 0.0, z: float = 0.0) -> dict[str, Any]:
@@ -231,4 +232,18 @@ def afterwards(folder: Path) -> Iterator[tuple[str, dict[str, Any], tuple[float,
     yield "+++++pane", made(box(50, 6, 50), [glass], 0.35, [SKY, BEHIND], 90, 30, 25, inside="centres"), (0.04, 0.1)
     yield "+++++plates at noon", made(ball(30), [plates], 0.25, [blue, noon], 160, 60, 30, 28), (0.03, 0.1)
     yield "+++++sand on end", made(box(16, 16, 60), [sand], 0.5, [SKY, LOW_SUN], 130, 40, 30, 40, True), (0.04, 0.1)
+    # fmt: on
+
+
+def at_last(folder: Path) -> Iterator[tuple[str, dict[str, Any], tuple[float, float]]]:
+    """Yield the set ++++++."""
+    salt, sugar, snow, fresh = (grain(name) for name in ("salt", "sugar", "coarse-snow", "fresh-snow"))
+    amber, ash = grain("glass-beads", [0.005, 0.02, 0.15]), grain("sand", [0.3, 0.3, 0.35])
+    side = {"type": "sun", "direction": [-1.0, -0.3, 0.5], "irradiance": [2.0, 1.8, 1.5], "angular_diameter_deg": 28.0}
+    # fmt: off
+    yield "++++++amber", made(box(24, 24, 12), [amber], 0.62, [SKY, side], 50, 50, 6, 36), (0.04, 0.12)
+    yield "++++++ash", made(heap(folder, 22, 16), [ash], 0.5, [SKY, side], 70, 30, 6, 40, True), (0.02, 0.06)
+    yield "++++++drift", made(box(120, 40, 25), [snow], 0.35, [SKY, side], 160, 60, 10, 42, True), (0.03, 0.1)
+    yield "++++++two sugars", made(ball(11), [sugar, salt], 0.55, [WHITE], 60, 25, 11, 26, True), (0.04, 0.1)
+    yield "++++++flurry", made(ball(45), [fresh], 0.04, [SKY, side], 260, 60, 45, 22), (0.03, 0.08)
     # fmt: on
