@@ -141,10 +141,11 @@ SUN = SunLight((0.6, 0.0, 0.8), (3.0, 3.0, 3.0), 0.53)
 def test_a_small_sun_is_left_to_levels_that_aim_at_it(ball: tsdf.Table, sky: float) -> None:
     """Single grains meet it once in 200,000 times; until then explicit is dark, or black, with no noise at all, and
     would be taken. So pilots look at a wider sun, what other levels miss is known, and so is about how much longer
-    explicit takes; and the picture is as bright as an explicit one under a sun as strong but wide."""
+    explicit takes, hours where there are seconds; and the picture is as bright as an explicit one under a sun as
+    strong but wide."""
     lights = (SUN, ConstantLight((sky,) * 3)) if sky else (SUN,)
     scene = replace(pile(ball, 9.0), lights=lights)
-    made = plan(scene, 0.05, threads=2)
+    made = plan(scene, 0.05, seconds=2.0, threads=2)
     one = made.chosen.candidate
     assert not one.explicit_grains and not LEVELS[one.level].traits.packed
     assert any("pilots look at suns" in note for note in made.notes)

@@ -44,6 +44,7 @@ CHECK = 0.15  # of what is left for pilots, for looks at what is chosen and was 
 BRIEF, MOST_CHECKS = 0.3, 3  # [s] that such a look takes at least, and how many there are at most
 WIDE, WIDEST = 16.0, 50.0  # [deg] of suns in pilots that are smaller in the picture, which single grains would hardly
 # ever meet, at least and at most
+UNFINISHED = 0.5  # [1] noise of pixels over their mean, above which single grains under small suns are but bright dots
 SOON = 0.5  # of `MEETINGS`, after the first round, that there will be enough of after the second
 ENOUGH = 4.0  # times `MEETINGS` that they are to be met in the time that the reference has
 NEAR = 3.0  # times as long as the best as a candidate may seem to take to be looked at again
@@ -412,7 +413,10 @@ class _Planning(Evidence):
         limit = self.limit / self.load
         if not takes <= limit and math.isfinite(limit):
             # sparkle that is not rendered to the end is nothing but noise; and what all miss tells none from the others
-            aimed = [p for p in found if not (self.rarer > 1.0 and singly(p.candidate))] or found
+            chance = self.rarer > 1.0
+            aimed = [
+                p for p in found if not (chance and singly(p.candidate) and p.noise(limit) > UNFINISHED)
+            ] or found  # fmt: skip
             least = min(p.likely_error(limit) for p in aimed)
             alike = [p for p in aimed if p.likely_error(limit) <= TIE * least]
             return min(alike, key=lambda p: math.hypot(p.bias, p.bias_error, p.noise(limit)))
