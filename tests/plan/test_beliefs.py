@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import tsdf
+from tsdf.data import library
 from tsdf.picture.footprint import texture
 from tsdf.plan import beliefs, needs, prior
 from tsdf.plan.pilot import spread
@@ -130,8 +131,7 @@ def test_pixels_are_spread(width: int, height: int, most: int) -> None:
 
 
 def test_what_tables_need() -> None:
-    """Records that are missing, and paths where few are known; nothing of a table that has all. The command is the one
-    that made it, with other options."""
+    """Records that are missing, and paths where few are known; nothing of a table that has all."""
     bare, full = tsdf.read(CHECKS / "PHYSICS_CHORD.tsdf.exr"), tsdf.read(CHECKS / "cube_memory.tsdf.exr")
     (line,) = needs.of_tables([("bare.exr", bare), ("bare.exr", bare)], 0.5, "explicit")
     assert line.startswith("bare.exr has no records by entry") and line.endswith("by tsdf-build with --memory 64")
@@ -142,5 +142,19 @@ def test_what_tables_need() -> None:
     (line,) = needs.of_tables([("full.exr", full)], 1e-4, "teleport-memory")
     off = full.header["standard_errors"]["mean_cosine"] / (1.0 - full.mean_cosine())
     assert f"knows 1 - g to {off:.1%} only" in line and "by tsdf-build with --paths" in line
-    made = needs._command("tsdf-build snow --paths 400000 --cells 256", "s.exr", {"--paths": "1e+08", "--joint": "32"})
-    assert made == "tsdf-build snow --paths 1e+08 --cells 256 --joint 32 --out s.exr"
+
+
+def test_a_better_table_takes_no_other_tables_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command that made it, with other options, into a file beside it that is not there yet; what is better than a
+    ready table is made where one is, not in the package."""
+    made, wants = "tsdf-build snow --paths 400000 --cells 256", {"--paths": "1e+08", "--joint": "32"}
+    own = str(tmp_path / "s.tsdf.exr")
+    said = f"tsdf-build snow --paths 1e+08 --cells 256 --joint 32 --out {tmp_path}/s-paths-joint.tsdf.exr"
+    assert needs._command(made, own, wants) == said
+    (tmp_path / "s-paths-joint.tsdf.exr").touch()
+    assert needs._command(f"{made} --out {own}", own, wants).endswith(
+        f"--out {tmp_path}/s-paths-joint-2.tsdf.exr --joint 32"
+    )
+    monkeypatch.chdir(tmp_path)
+    ready = str(library.ready("sugar"))
+    assert needs._command(made, ready, {"--memory": "64"}).endswith("--memory 64 --out sugar-memory.tsdf.exr")

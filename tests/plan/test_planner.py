@@ -4,14 +4,16 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import tsdf
+from tsdf.data import library
 from tsdf.errors import SceneError, UsageError
 from tsdf.picture import render, world
-from tsdf.plan import planner, report, shot
+from tsdf.plan import evidence, planner, report, shot
 from tsdf.plan.beliefs import CERTAIN, Belief
 from tsdf.plan.pilot import Apart, Pilot
 from tsdf.plan.planner import plan
@@ -121,8 +123,8 @@ def test_other_wishes_other_choices(far: Plan, ball: tsdf.Table) -> None:
     assert p.noise(4.0) == pytest.approx(0.5 * p.noise(1.0)) and p.error(p.seconds(0.03)) == pytest.approx(0.03)
     hurried = plan(pile(ball, 160.0), 0.002, seconds=0.5, threads=2)
     assert "least" in hurried.why[0]
-    errors = [math.hypot(p.floor.high, p.noise(0.5 / hurried.load)) for p in hurried.predictions]
-    assert errors[0] == min(errors)
+    errors = [math.hypot(p.floor.value, p.floor.error, p.noise(0.5 / hurried.load)) for p in hurried.predictions]
+    assert errors[0] <= planner.TIE * min(errors)
 
 
 def test_only_the_camera_matters_to_scenes_without_grains() -> None:
@@ -138,16 +140,19 @@ SUN = SunLight((0.6, 0.0, 0.8), (3.0, 3.0, 3.0), 0.53)
 @pytest.mark.parametrize("sky", [0.1, 0.0])
 def test_a_small_sun_is_left_to_levels_that_aim_at_it(ball: tsdf.Table, sky: float) -> None:
     """Single grains meet it once in 200,000 times; until then explicit is dark, or black, with no noise at all, and
-    would be taken. So it is not, and the picture is as bright as an explicit one under a sun as strong but wide."""
+    would be taken. So pilots look at a wider sun, what other levels miss is known, and so is about how much longer
+    explicit takes, hours where there are seconds; and the picture is as bright as an explicit one under a sun as
+    strong but wide."""
     lights = (SUN, ConstantLight((sky,) * 3)) if sky else (SUN,)
     scene = replace(pile(ball, 9.0), lights=lights)
-    made = plan(scene, 0.05, threads=2)
+    made = plan(scene, 0.05, seconds=2.0, threads=2)
     one = made.chosen.candidate
     assert not one.explicit_grains and not LEVELS[one.level].traits.packed
-    assert any("levels that aim at lights" in note for note in made.notes)
-    assert math.isfinite(made.chosen.variance) and math.isinf(of(made, "explicit").variance)
+    assert any("pilots look at suns" in note for note in made.notes)
+    assert 100.0 * made.chosen.variance < of(made, "explicit").variance < math.inf
+    assert made.chosen.piloted and 0.1 < made.chosen.texture < 1.5 and made.chosen.floor.error < made.chosen.texture
     assert f"{made.chosen.candidate}" in made.why[0] and json.dumps(report.facts(made), allow_nan=False)
-    assert report.table(made)[1].startswith(str(one)) and any("not known" in line for line in report.table(made))
+    assert report.table(made)[1].startswith(str(one)) and made.scene.lights == lights
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("warnings.warn", lambda *_, **__: None)
         patch.setattr(shot, "plan", lambda *_: made)
@@ -155,6 +160,34 @@ def test_a_small_sun_is_left_to_levels_that_aim_at_it(ball: tsdf.Table, sky: flo
         wide = replace(scene, lights=(replace(SUN, angular_diameter_deg=15.0), *lights[1:]))
         truth = tsdf.render(wide, "explicit", spp=1500, threads=2)
     assert found.rgb.mean() == pytest.approx(truth.rgb.mean(), rel=0.15)  # the level's bias and truth's noise of 3 %
+
+
+def test_what_single_grains_take_under_a_small_sun(ball: tsdf.Table) -> None:
+    """Is about what a picture at level explicit has, under a sun that this meets often enough to tell: 4 degrees, a
+    small part of what pilots look at. It is an upper bound, for not all of the variance is the sun's."""
+    scene = replace(pile(ball, 9.0), lights=(replace(SUN, angular_diameter_deg=4.0),))
+    said = of(plan(scene, 0.2, threads=2), "explicit")
+    picture = render.render(world.build(scene, "explicit"), spp=2000, seed=3, threads=2)
+    found = 2000 * float(picture.variance.mean()) / float(picture.rgb.mean()) ** 2
+    assert 0.7 < said.variance / found < 2.0
+
+
+def test_light_that_goes_straight_on_finds_suns_by_chance() -> None:
+    """Cubes let much of the light through parallel facets exactly straight on, along which no level aims: its variance
+    grows as a sun shrinks, but for levels that know no such light. What is said of a sun of 4 degrees, by pilots of
+    a wider one, is about what a pilot of it sees; that of the lobe stays."""
+    table = tsdf.read(library.ready("salt"))
+    scene = replace(pile(table, 60.0), lights=(replace(SUN, angular_diameter_deg=4.0), ConstantLight((0.3,) * 3)))
+    made = plan(scene, 0.2, threads=2)
+    for level, grows in (("volume", True), ("volume-hg", False)):
+        pilot = Pilot(world.build(scene, level), 7, 2, 400)
+        pilot.run(1.0)
+        wide = Pilot(
+            world.build(replace(scene, lights=(replace(SUN, angular_diameter_deg=16.0), scene.lights[1])), level), 7
+        )
+        wide.run(0.2)
+        assert (pilot.seen.variance > 3.0 * wide.seen.variance) == grows
+        assert of(made, level).variance == pytest.approx(pilot.seen.variance, rel=0.6)
 
 
 def test_where_there_is_nothing_to_see(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -271,9 +304,9 @@ def test_pilots_render_what_is_taken(ball: tsdf.Table, monkeypatch: pytest.Monke
         for k in (0, 8):
             assert run.add(Candidate("teleport-memory", k))
             seen[far].append(int(run.pilots[Candidate("teleport-memory", k)].world.met.sum()))
-        whole = Belief(0.4, 0.05)
-        assert run.faded(whole, 0.0, 0.0, 0, 1).value <= 0.4 * (1.0 if far else 0.8)
-        left = run.faded(whole, 0.0, 0.0, 0, 8).value / run.faded(whole, 0.0, 0.0, 8, 16).value
+        whole, one = Belief(0.4, 0.05), run.expected["teleport-memory"]
+        assert run.faded(one, 0.0, 0.0, whole, 0, 1)[2].value <= 0.4 * (1.0 if far else 0.8)
+        left = run.faded(one, 0.0, 0.0, whole, 0, 8)[2].value / run.faded(one, 0.0, 0.0, whole, 8, 16)[2].value
         assert left == pytest.approx(run.ratio if far else 1.0)
     assert seen[True][0] == 0 < seen[True][1] and seen[False] == [0, 0]
 
@@ -294,7 +327,7 @@ def test_what_levels_miss_alike_is_by_the_best_measured(ball: tsdf.Table, monkey
         missed = run.missed(Candidate(level))
         assert missed is not None and missed.value == pytest.approx(math.sqrt(0.011), rel=0.02)
         floor = run.without(Candidate(level), run.expected[level]._replace(bias=0.0))[2]
-        assert floor.value == pytest.approx(math.sqrt(0.011), rel=planner.ALIKE) and floor.error >= 0.99 * best.error
+        assert floor.value == pytest.approx(math.sqrt(0.011), rel=evidence.ALIKE) and floor.error >= 0.99 * best.error
     assert run.missed(Candidate("teleport")) is None
 
 
@@ -312,3 +345,82 @@ def test_noise_is_over_the_true_mean(ball: tsdf.Table) -> None:
     run.pilots[one].squares *= 4.0
     assert run.pilots[one].seen.variance == pytest.approx(own.variance)
     assert run.predicted(one).variance == pytest.approx(4.0 * before)
+
+
+def test_bias_falls_with_the_grains_that_are_left_to_a_level(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a bias that all packings share as much is left as there is light that meets more grains yet, in a deep
+    medium it stays; what one packing differs by falls as its texture does. A pilot with some has the last word."""
+    run = planner._Planning(pile(ball, 160.0), 0.05, None, 0, 2)
+    run.look()
+    run.refer()
+    one, whole = run.expected["teleport"], Belief(0.1, 0.0)
+    monkeypatch.setattr(planner._Planning, "length", 8.0)
+    monkeypatch.setattr(planner._Planning, "of_one_packing", lambda *_: 0.0)
+    assert run.faded(one, 0.02, 0.0, whole, 0, 8)[0] == pytest.approx(0.02 * (7.0 / 8.0) ** 8)
+    monkeypatch.setattr(planner._Planning, "length", 800.0)
+    assert run.faded(one, 0.02, 0.0, whole, 0, 8)[0] == pytest.approx(0.02, rel=0.02)
+    monkeypatch.setattr(planner._Planning, "of_one_packing", lambda *_: 1e3)
+    assert run.faded(one, 0.02, 0.0, whole, 0, 8)[0] == pytest.approx(0.02 * math.exp(-2.0), rel=0.01)
+    apart = {
+        Candidate("teleport"): Apart(0.02, 1e-4, 4e-4, 1e-6),
+        Candidate("teleport", 8): Apart(0.003, 1e-4, 9e-6, 1e-6),
+    }
+    monkeypatch.setattr(planner._Planning, "apart", lambda _, candidate: apart.get(candidate))
+    assert run.predicted(Candidate("teleport", 8)).bias == pytest.approx(0.003, rel=0.1)
+    assert abs(run.predicted(Candidate("teleport", 16)).bias) < 0.0031
+
+
+def test_bolder_leaps_are_looked_at_where_they_may_win(far: Plan, ball: tsdf.Table) -> None:
+    """At the level whose events are dear, where there are leaps, nobody has named any, and the error would still do;
+    what is taken is rendered so, and the options that fix it say so."""
+    run = planner._Planning(pile(ball, 160.0), 0.05, None, 0, 2)
+    chosen = replace(of(far, "teleport-memory"), floor=Belief(0.02, 0.005))
+    run.pilots[chosen.candidate] = SimpleNamespace(world=SimpleNamespace(leap=2.0))
+    bold = run.bolder_of(chosen)
+    assert bold == Candidate("teleport-memory", 0, evidence.BOLD) and str(bold) == "teleport-memory leap=1"
+    assert run.bolder_of(replace(chosen, floor=Belief(0.0497, 0.0))) is None
+    run.pilots[Candidate("volume")] = run.pilots[chosen.candidate]
+    assert run.bolder_of(replace(chosen, candidate=Candidate("volume"))) is None
+    run.pilots[chosen.candidate] = SimpleNamespace(world=SimpleNamespace(leap=0.0))
+    assert run.bolder_of(chosen) is None
+    made = replace(far, predictions=(replace(chosen, candidate=bold), *far.predictions))
+    assert made.planned.render.leap == 1.0 and report.options(made) == "--level teleport-memory --leap 1"
+    assert report.chosen_facts(made)["leap"] == 1.0
+    run.reference = chosen.candidate
+    bias_error, floor = run.bolder(bold, 0.001, chosen.floor)
+    assert bias_error > evidence.BOLD_BIAS and floor.value > chosen.floor.value and floor.error >= chosen.floor.error
+
+
+def test_flat_facets_sparkle_under_small_suns(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The square of what cubes miss under a sun of 8 degrees is what pilots of a wider one see times how much more of
+    the sky that takes; a sphere's stays. (A picture of cubes in the sun of bench_plan says so, too.)"""
+    for table, flat in ((ball, False), (tsdf.read(library.ready("salt")), True)):
+        scene = replace(pile(table, 120.0), lights=(replace(SUN, angular_diameter_deg=8.0),))
+        run = planner._Planning(scene, 0.1, None, 0, 2)
+        run.look()
+        more = (run.wide / 8.0) ** 2 if flat else 1.0
+        assert run.sparkle == pytest.approx(more, rel=0.05) and (more > 3.0) == flat
+        run.refer()
+        assert run.add(Candidate("volume"))
+        for pilot in run.pilots.values():
+            pilot.each = 1
+        monkeypatch.setattr(planner._Planning, "trusted", lambda *_: True)
+        monkeypatch.setattr(Pilot, "apart", lambda *_: Apart(0.01, 0.001, 0.2, 0.1))
+        seen = run.apart(Candidate("volume"))
+        assert seen is not None and seen.bias == 0.01
+        assert (seen.square, seen.square_error) == pytest.approx((0.2 * more, 0.1 * more), rel=0.05)
+
+
+def test_what_chains_miss_after_explicit_grains_is_alike(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pilot of one chain with three explicit grains first tells of others with three, less surely; not of none."""
+    run = planner._Planning(pile(ball, 160.0), 0.05, None, 0, 2)
+    run.look()
+    run.refer()
+    before = [run.predicted(Candidate("teleport-memory", k)).floor for k in (0, 3)]
+    one = Candidate("teleport", 3)
+    assert run.add(one)
+    monkeypatch.setattr(planner._Planning, "apart", lambda _, c: Apart(0.0, 1e-4, 1e-4, 1e-6) if c == one else None)
+    own, other = run.predicted(one).floor, run.predicted(Candidate("teleport-memory", 3)).floor
+    assert own.value == pytest.approx(0.01, rel=0.1) and other.value == pytest.approx(0.01, rel=0.3)
+    assert before[1].value < 0.3 * other.value and other.error > own.error
+    assert run.predicted(Candidate("teleport-memory")).floor == before[0]

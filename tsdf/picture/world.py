@@ -227,6 +227,7 @@ def _triple(v: np.ndarray) -> tuple[float, float, float]:
 def build(
     scene: Scene, level: str, limit: int = MAX_EVENTS, leap: float | None = None,
     progress: Callable[[float, str], None] | None = None, places: dict[bool, Place] | None = None,
+    packings: dict[bool, Packed] | None = None,
 ) -> World:  # fmt: skip
     """Return a scene ready to be rendered at a level.
 
@@ -243,6 +244,8 @@ def build(
         Called with the share done and a word about it while records for leaps are made.
     places : dict, optional
         Geometry of the same scene, as far as it has been made, with and without single grains; it is added to.
+    packings : dict, optional
+        Its packed grains likewise, traced and not.
 
     Raises
     ------
@@ -315,7 +318,10 @@ def build(
         notes += hybrid_notes(scene, tables, layers)
     grains = nothing_packed(len(scene.media), len(tables))
     if singles and scene.media:
-        grains = packed(scene, tables, traced=not traits.answered)
+        traced, packings = not traits.answered, {} if packings is None else packings
+        if traced not in packings:
+            packings[traced] = packed(scene, tables, traced)
+        grains = packings[traced]
     ready = World(
         scene=scene,
         level=level,

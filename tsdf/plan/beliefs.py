@@ -64,9 +64,12 @@ def of_square(expected: float, spread: float, square: float | None = None, error
     return Belief(float(value), float(most - value))
 
 
-def of_bias(expected: float, measured: float | None = None, error: float = math.inf) -> tuple[float, float]:
-    """Return what is believed of a bias whose size, not sign, is expected, and its standard error."""
+def of_bias(
+    expected: float, measured: float | None = None, error: float = math.inf, about: float = 0.0
+) -> tuple[float, float]:
+    """Return what is believed of a bias and its standard error; expected is its size, not its sign, or by how much it
+    may differ from what it is `about`."""
     if measured is None or not expected > 0.0:
-        return 0.0, expected
+        return about, expected
     prior, own = 1.0 / expected**2, 1.0 / max(error, 1e-9) ** 2
-    return measured * own / (prior + own), math.sqrt(1.0 / (prior + own))
+    return (about * prior + measured * own) / (prior + own), math.sqrt(1.0 / (prior + own))

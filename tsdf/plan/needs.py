@@ -2,7 +2,9 @@
 
 import shlex
 from collections.abc import Sequence
+from pathlib import Path
 
+from tsdf.data import library
 from tsdf.data.table import Table
 from tsdf.scene.levels import LEVELS
 
@@ -51,15 +53,25 @@ def of_tables(tables: Sequence[tuple[str, Table]], target: float, level: str, ch
 
 
 def _command(made: str, name: str, wants: dict[str, str]) -> str:
-    """Return the command that made a table, with other options, or what they are where it is not known."""
+    """Return the command that made a table, with other options and into a file that is not there yet; or what the
+    options are, where it is not known."""
     words = shlex.split(made) if made.startswith("tsdf-build ") else []
     if not words:
         return "build it by tsdf-build with " + " ".join(f"{option} {value}" for option, value in wants.items())
-    for option, value in wants.items():
+    for option, value in {**wants, "--out": _beside(name, wants)}.items():
         if option in words:
             words[words.index(option) + 1] = value
         else:
             words += [option, value]
-    if "--out" not in words:
-        words += ["--out", name]
     return shlex.join(words)
+
+
+def _beside(name: str, wants: dict[str, str]) -> str:
+    """Return a name for a better table that no file has, beside the one that it is better than; of a ready table in the
+    folder one is in."""
+    path = Path(name)
+    stem = path.name.removesuffix(".exr").removesuffix(".tsdf")
+    folder = Path() if path.parent == library.FOLDER else path.parent
+    stem += "".join(option.removeprefix("-") for option in wants)
+    tried = [f"{stem}.tsdf.exr", *(f"{stem}-{n}.tsdf.exr" for n in range(2, 1000))]
+    return str(folder / next((one for one in tried if not (folder / one).exists()), tried[0]))

@@ -7,6 +7,8 @@ from tsdf.plan.beliefs import Belief
 from tsdf.scene.scene import Scene
 from tsdf.study.candidates import Candidate, taken
 
+TIE = 1.1  # times as long as the cheapest as it may take, of those the one with the least error is taken
+
 
 @dataclass(frozen=True)
 class Prediction:
@@ -47,6 +49,10 @@ class Prediction:
     def error(self, seconds: float) -> float:
         """Return the whole error after so long [s]."""
         return math.hypot(self.floor.value, self.noise(seconds))
+
+    def likely_error(self, seconds: float) -> float:
+        """Return the root mean square of the whole error after so long [s], over what the floor may be."""
+        return math.hypot(self.error(seconds), self.floor.error)
 
     def seconds(self, target: float, floor: float | None = None) -> float:
         """Return the time to an error [s], infinite where it is out of reach; `floor` instead of what is believed."""

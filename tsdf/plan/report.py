@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tsdf.plan.prediction import Plan, Prediction
+from tsdf.plan.prediction import TIE, Plan, Prediction
 from tsdf.plan.prior import Body
 
 TARGETS = np.geomspace(0.002, 0.5, 120)  # [1] that are tried for what would change a plan's mind
@@ -34,6 +34,11 @@ def percent(value: float) -> str:
     if not math.isfinite(value):
         return "not known"
     return f"{100.0 * value:.2g} %" if abs(value) < 0.995 else f"{100.0 * value:.0f} %"
+
+
+def digits(number: float) -> str:
+    """Return a number with two digits, however large."""
+    return f"{number:.2g}" if abs(number) < 99.5 else f"{float(f'{number:.2g}'):.0f}"
 
 
 def span(seconds: float) -> str:
@@ -67,6 +72,9 @@ def _first(plan: Plan) -> str:
     elif plan.seconds is not None and plan.able is not None:
         after = f"an error of {percent(p.error(plan.able))} after {span(plan.seconds)}"
         met = f"none is sure to meet {percent(plan.target)} in that time, and this one has least"
+        able = plan.able
+        if min(one.likely_error(able) for one in plan.predictions) * TIE < p.likely_error(able):
+            met += " of those that aim at lights"
         if takes <= plan.able:
             met = f"{percent(plan.target)} after {_about(takes)}"
     elif math.isinf(takes):
@@ -84,10 +92,10 @@ def _reason(plan: Plan, bodies: Sequence[Body], footprint: float, coverage: floa
     if not bodies:
         return "because there are no grains in the scene, and all levels are the same"
     body = max(bodies, key=lambda one: one.thickness)
-    seen = f"a pixel covers {footprint:.2g} R" if math.isfinite(footprint) else "no grains are seen"
-    deep = body.thickness / body.transport
-    which = f"the thickest of {len(bodies)} media has " if len(bodies) > 1 else ""
-    where = f"{seen}, {which}f = {body.packing_fraction:g}, {body.thickness:.2g} R or {deep:.2g} l* thick"
+    seen = f"a pixel covers {footprint:.2g} R of grains" if math.isfinite(footprint) else "it sees no grains,"
+    thick = f"{digits(body.thickness)} R or {digits(body.thickness / body.transport)} transport lengths"
+    which = f" in the thickest of {len(bodies)} media" if len(bodies) > 1 else ""
+    where = f"{seen} that fill {100.0 * body.packing_fraction:.3g} % of {thick}{which}"
     turn = chosen.variance * chosen.turn
     worse = [p for p in plan.predictions[1:] if p.variance * p.turn < turn and p.floor.high > 0.0]
     nearest = min(worse, key=lambda p: p.floor.value, default=None)
@@ -98,6 +106,8 @@ def _reason(plan: Plan, bodies: Sequence[Body], footprint: float, coverage: floa
 def _other(plan: Plan) -> str:
     if len(plan.predictions) < 2:
         return "no other candidate is possible"
+    if plan.able is not None and plan.spp is None and not plan.chosen.seconds(plan.target) <= plan.able:
+        return _short_of_time(plan, plan.able)
     second, chosen = plan.predictions[1], plan.chosen
     takes = second.safe_seconds(plan.target)
     runner = f"runner-up: {second.candidate}, {span(takes)}" if math.isfinite(takes) else (
@@ -106,10 +116,11 @@ def _other(plan: Plan) -> str:
     flips = {}
     for target in TARGETS:
         best = min(plan.predictions, key=lambda p: p.safe_seconds(float(target)))
-        if math.isfinite(best.safe_seconds(float(target))):
+        takes = best.safe_seconds(float(target))
+        if math.isfinite(takes) and chosen.safe_seconds(float(target)) > TIE * takes:
             flips[float(target)] = best
-    lower = [t for t, p in flips.items() if OTHER * t < plan.target and p is not chosen]
-    upper = [t for t, p in flips.items() if t > OTHER * plan.target and p is not chosen]
+    lower = [t for t in flips if OTHER * t < plan.target]
+    upper = [t for t in flips if t > OTHER * plan.target]
     changes = []
     if lower:
         changes.append(f"a target below {percent(max(lower))} ({flips[max(lower)].candidate})")
@@ -120,6 +131,19 @@ def _other(plan: Plan) -> str:
         if changes
         else f"{runner}; no other target would change this"
     )
+
+
+def _short_of_time(plan: Plan, able: float) -> str:
+    assert plan.seconds is not None
+    known = [p for p in plan.predictions[1:] if math.isfinite(p.variance)] or plan.predictions[1:]
+    second = min(known, key=lambda p: p.likely_error(able))
+    runner = f"runner-up: {second.candidate}, an error of {percent(second.error(able))} then"
+    best = min(plan.predictions, key=lambda p: p.safe_seconds(plan.target))
+    takes = best.safe_seconds(plan.target) * plan.load
+    if not math.isfinite(takes):
+        return f"{runner}; no time is known to be enough for {percent(plan.target)}"
+    more = f"{best.candidate} and {span(takes)} instead of {span(plan.seconds)}"
+    return f"{runner}; {percent(plan.target)} would take {more}"
 
 
 def table(plan: Plan) -> list[str]:
@@ -198,6 +222,7 @@ def chosen_facts(plan: Plan) -> dict[str, Any]:
         "level": one.level,
         "explicit_grains": one.explicit_grains,
         "fewer_far": plan.fewer_far,
+        "leap": one.leap,
         "target": plan.target,
         "noise": plan.noise,
     }
@@ -209,6 +234,8 @@ def options(plan: Plan) -> str:
     words = f"--level {one.level}"
     if one.explicit_grains:
         words += f" --explicit-grains {one.explicit_grains}" + "-0" * plan.fewer_far
+    if one.leap is not None:
+        words += f" --leap {one.leap:g}"
     return words
 
 

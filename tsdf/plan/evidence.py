@@ -1,0 +1,336 @@
+"""Evidence: what is expected of the candidates of a scene, what pilots saw of them, and what both together say.
+
+Level explicit is right by definition; where it cannot be piloted, the reference is the next best that can, and what
+that is expected to get wrong is added. With explicit grains first, texture and bias fade: after how many is a law
+until pilots with some have been seen.
+"""
+
+import math
+
+from tsdf.errors import TSDFError
+from tsdf.picture.footprint import PER_E
+from tsdf.plan import beliefs, prior
+from tsdf.plan.beliefs import Belief
+from tsdf.plan.pilot import Apart, Pilot, Seen
+from tsdf.plan.prediction import Prediction
+from tsdf.scene.levels import LEVELS
+from tsdf.study.candidates import Candidate, candidates
+
+GRAINS = (0, 3, 8, 16)  # explicit ones before a chain
+MEETINGS = 400.0  # of lights that are met by chance alone, that a pilot is believed from on: its mean, and what others
+# differ from it by, is known to a twentieth then, and the error bar of that to as much
+LEAST_PER_E = 2.0  # explicit grains of facets that bring texture down by e, at least
+ALIKE = 0.2  # of the logarithm of an error, what two levels of teleportation may differ by
+LEAST = 1e-4  # [1] of an error
+UNSURE = 0.8  # of the logarithm of texture, what that law may be off by for other grains than spheres
+FADING = 0.3  # of the logarithm of texture, what that law may be off by; and of what is left of a bias
+FLAT = 0.1  # share of light that goes straight on from which on grains are flat all over
+BOLD = 1.0  # [l*] least radius of leaps that are bolder than they are by default
+BOLD_BIAS = 0.006  # [1] that they may be off by (docs/leaps.md)
+
+
+class Evidence:
+    """What is known of a scene's candidates.
+
+    Attributes
+    ----------
+    expected : dict
+        Of levels, before anything is rendered.
+    pilots : dict
+    reference : Candidate or None
+        What the others are held against.
+    impossible, refused : dict, set
+        Levels of which there is no world, and why; candidates likewise.
+    footprint, coverage, ratio : float
+        How grains look, see `prior.looks`.
+    far : bool
+        Whether the explicit grains are to be fewer where a pixel covers more.
+    chance : float
+        Kurtosis of lights that single grains meet by chance, 0 where there are none.
+    rarer : float
+        How many times as seldom they are met in the picture as in pilots, whose suns are wider.
+    atoms : float
+        Share of the light that grains let go exactly straight on or send exactly back.
+    explicit_sample : float
+        Time of a sample at level explicit of one thread, where that is not piloted [s].
+    """
+
+    def __init__(self, pixels: int, threads: int) -> None:
+        self.pixels, self.threads = pixels, threads
+        self.bodies: list[prior.Body] = []
+        self.expected: dict[str, prior.Expected] = {}
+        self.pilots: dict[Candidate, Pilot] = {}
+        self.reference: Candidate | None = None
+        self.impossible: dict[str, TSDFError] = {}
+        self.refused: set[Candidate] = set()
+        self.footprint, self.coverage, self.ratio, self.far = math.inf, 0.0, 1.0, False
+        self.chance, self.rarer, self.atoms = 0.0, 1.0, 0.0
+        self.explicit_sample = math.inf
+
+    def predictions(self) -> list[Prediction]:
+        """Return what is predicted of every candidate that is possible."""
+        bold = [one for one in self.pilots if one.leap is not None]
+        return [
+            self.predicted(one)
+            for one in (*candidates(tuple(LEVELS), GRAINS), *bold)
+            if one.level not in self.impossible
+            and one not in self.refused
+            and not (one.explicit_grains and "explicit" in self.impossible)
+        ]
+
+    def trusted(self, pilot: Pilot) -> bool:
+        """Return whether a pilot has seen light, and met what only chance finds of it often enough to be believed."""
+        if not pilot.seen.mean > 0.0:
+            return False
+        return not (self.chance and pilot.world.media.singles) or self.often(pilot)
+
+    def often(self, pilot: Pilot, share: float = 1.0) -> bool:
+        """Return whether a pilot has samples enough for lights that chance finds, or a share of enough."""
+        return not self.chance or pilot.seen.samples * self.coverage / self.chance > share * MEETINGS
+
+    def hidden(self, candidate: Candidate) -> bool:
+        """Return whether a candidate's single grains meet lights too seldom for its variance to be known: by the pilot
+        of level explicit or the reference, if that has single grains, or else by its own or one of as many samples."""
+        assert self.reference is not None
+        if not singly(candidate):
+            return False
+        best = self.pilots.get(Candidate("explicit"), self.pilots[self.reference])
+        return not self.often(best if best.world.media.singles else self.pilots.get(candidate, best))
+
+    def apart(self, candidate: Candidate) -> Apart | None:
+        """Return how a candidate differs from the reference as far as that is known."""
+        assert self.reference is not None
+        own, other = self.pilots.get(candidate), self.pilots[self.reference]
+        if own is None or own is other or not own.each or not other.each:
+            return None
+        if not self.trusted(own) or not self.trusted(other):
+            return None
+        seen, more = own.apart(other), self.sparkle
+        return seen._replace(square=more * seen.square, square_error=more * seen.square_error)
+
+    @property
+    def sparkle(self) -> float:
+        """How many times as much the square of texture is under the suns of the picture as under those of pilots: flat
+        facets mirror a smaller sun as much more seldom as it is brighter, curved ones make a small image of any."""
+        return 1.0 + (self.rarer - 1.0) * min(self.atoms / FLAT, 1.0)
+
+    def predicted(self, candidate: Candidate) -> Prediction:
+        """Return what is predicted of a candidate."""
+        level, k = candidate.level, candidate.explicit_grains
+        plain = Candidate(level)
+        one = self.expected[level]
+        bias, bias_error, floor, known = self.without(plain, one)
+        base = 0
+        for fewer in GRAINS[1:]:  # what is seen of fewer explicit grains says more of this number than none does
+            later = self.apart(Candidate(level, fewer)) if fewer <= k else None
+            alike = self.seen_after(fewer) if fewer <= k else None  # what other chains miss then
+            if later is None and alike is None:
+                continue
+            bias, bias_error, floor = self.faded(one, bias, bias_error, floor, base, fewer)
+            if later is not None:
+                floor = beliefs.of_square(max(floor.value, LEAST), UNSURE, later.square, later.square_error)
+                bias, bias_error = beliefs.of_bias(max(bias_error, LEAST), later.bias, later.bias_error, bias)
+            elif alike is not None:
+                square = alike.square - alike.bias**2 + bias**2
+                floor = beliefs.of_square(max(floor.value, LEAST), UNSURE, square, alike.square_error)
+                floor = floor._replace(error=math.hypot(floor.error, ALIKE * floor.value))
+            base, known = fewer, True
+        bias, bias_error, floor = self.faded(one, bias, bias_error, floor, base, k)
+        if candidate.leap is not None:
+            bias_error, floor = self.bolder(candidate, bias_error, floor)
+        floor = self.beside_the_reference(candidate, floor)
+        texture, most = (math.sqrt(max(value**2 - bias**2, 0.0)) for value in (floor.value, floor.high))
+        seen, piloted = self.cost(candidate)
+        turn = seen.seconds * self.pixels / self.threads
+        return Prediction(
+            candidate, bias, bias_error, texture, most - texture, floor, seen.variance, turn, piloted, known,
+        )  # fmt: skip
+
+    def seen_after(self, k: int) -> Apart | None:
+        """Return what pilots of chains with so many explicit grains first saw, by the one that knows it best: all miss
+        the same texture."""
+        seen = [self.apart(one) for one in self.pilots if one.explicit_grains == k and one.leap is None]
+        return min((one for one in seen if one is not None), key=lambda one: one.square_error, default=None)
+
+    def bolder(self, candidate: Candidate, bias_error: float, floor: Belief) -> tuple[float, Belief]:
+        """Return the error of a bias and a floor with what bolder leaps may add, and what their pilot saw of it."""
+        value = max(math.hypot(floor.value, BOLD_BIAS), LEAST)
+        spread = math.log1p(max(floor.error, 0.5 * (value - floor.value)) / value)
+        if (seen := self.apart(candidate)) is not None:
+            return math.hypot(bias_error, BOLD_BIAS), beliefs.of_square(value, spread, seen.square, seen.square_error)
+        return math.hypot(bias_error, BOLD_BIAS), Belief(value, value * math.expm1(spread))
+
+    def without(self, plain: Candidate, one: prior.Expected) -> tuple[float, float, Belief, bool]:
+        """Return bias, its error and the floor of a candidate without explicit grains, and whether these are known."""
+        apart, spread = self.apart(plain), max(one.spread, 1e-9)
+        if apart is None and plain.level == "teleport-joint":
+            apart, spread = self.apart(Candidate("teleport")), spread + ALIKE
+        wide = math.hypot(one.bias, self.of_one_packing(one))
+        bias, bias_error = beliefs.of_bias(wide, apart and apart.bias, apart.bias_error if apart else math.inf)
+        square, error = (apart.square, apart.square_error) if apart else (None, math.inf)
+        size = one.floor
+        if (missed := self.missed(plain)) is not None and size:
+            size = math.hypot(missed.value, math.hypot(one.bias, 0.5 * one.bias))
+            spread = max(math.log1p(missed.error / missed.value), ALIKE) if one.bias < missed.value else spread
+        elif apart is None and LEVELS[plain.level].traits.packed:  # it misses a part of the same texture
+            size = math.hypot(one.bias, one.texture * self.rougher())
+        floor = beliefs.of_square(size, spread, square, error)
+        if missed is not None and size:  # both are held against the same samples of the reference
+            floor = floor._replace(error=max(floor.error, missed.error))
+        return bias, bias_error, floor, one.known or apart is not None
+
+    def missed(self, plain: Candidate) -> Belief | None:
+        """Return the texture that all levels without single grains miss alike, by the pilot that knows it best; None
+        for that, and for levels that have some of it."""
+        best = self.best_known()
+        if best is None or best == plain or LEVELS[plain.level].traits.packed:
+            return None
+        return self.texture_of(best)
+
+    def texture_of(self, best: Candidate) -> Belief:
+        """Return the texture that a candidate without single grains misses, by its pilot."""
+        apart, one = self.apart(best), self.expected[best.level]
+        assert apart is not None
+        floor = beliefs.of_square(one.floor, max(one.spread, 1e-9), apart.square, apart.square_error)
+        off = min(abs(apart.bias), 0.9 * floor.value)
+        texture = max(math.sqrt(floor.value**2 - off**2), LEAST)
+        return Belief(texture, math.hypot(floor.value * floor.error, off * apart.bias_error) / texture)
+
+    def best_known(self) -> Candidate | None:
+        """Return the candidate without single grains whose pilot says most of the texture that it misses."""
+        alike = [c for c in self.pilots if not c.explicit_grains and not LEVELS[c.level].traits.packed]
+        seen = {c: apart for c in alike if (apart := self.apart(c)) is not None}
+        # by the error of texture squared, not by its value: the least of several values is too small
+        return min(
+            seen, key=lambda c: math.hypot(seen[c].square_error, 2.0 * seen[c].bias * seen[c].bias_error), default=None
+        )
+
+    def rougher(self) -> float:
+        """Return how many times as much texture the scene has as is expected, as far as that was seen."""
+        best = self.best_known()
+        expected = self.expected[best.level].texture if best is not None else 0.0
+        return self.texture_of(best).value / expected if best is not None and expected else 1.0
+
+    def beside_the_reference(self, candidate: Candidate, floor: Belief) -> Belief:
+        """Return a floor with what the reference itself may be off by, where that is not level explicit; with explicit
+        grains first there is less of it."""
+        assert self.reference is not None
+        if self.reference.level == "explicit" or candidate.level == "explicit":
+            return floor
+        own = self.expected[self.reference.level]
+        off = beliefs.of_square(own.floor, max(own.spread, 1e-9))
+        off = self.faded(own, 0.0, own.bias, off, 0, candidate.explicit_grains)[2]
+        if candidate.level == self.reference.level:
+            return off
+        return Belief(math.hypot(floor.value, off.value), math.hypot(floor.error, off.error))
+
+    def of_one_packing(self, one: prior.Expected) -> float:
+        """Return what of texture is left in the mean of the picture, of as many grains as there are in it: a plan is of
+        one packing."""
+        each = min(1.0, self.footprint**2 / math.pi)  # of a grain, that a pixel sees
+        return one.texture / math.sqrt(max(self.coverage * self.pixels * each, 1.0))
+
+    def faded(
+        self, one: prior.Expected, bias: float, bias_error: float, floor: Belief, before: int, k: int
+    ) -> tuple[float, float, Belief]:
+        """Return what is left of a bias, its error and a floor with k explicit grains, of one with fewer.
+
+        Texture falls by e for every `per_e` of them, and so does what it adds to the mean; what a level makes of all
+        packings alike falls as the share of grains that are still met at that level, of as many as light meets. Where
+        the first go by pixel, all pixels come to what the one is left with that has most.
+        """
+        if k == before:
+            return bias, bias_error, floor
+        off = min(math.hypot(bias, bias_error), floor.value)
+        left = math.exp((before - k) * max(1.0 / self.per_e, self.lasting))
+        if self.far and not before:
+            left = min(1.0, self.ratio * left)
+        packing, alike = self.of_one_packing(one), math.exp((before - k) * self.lasting)
+        share = one.bias**2 / max(one.bias**2 + packing**2, 1e-30)
+        less = math.sqrt(share * alike**2 + (1.0 - share) * left**2)
+        bias, bias_error = bias * less, math.hypot(bias_error, FADING * bias) * less
+        texture = math.sqrt(max(floor.value**2 - off**2, 0.0)) * left
+        value = math.hypot(texture, min(math.hypot(bias, bias_error), floor.value))
+        unsure = math.hypot(floor.error * left, FADING * texture)
+        return bias, bias_error, Belief(value, math.hypot(unsure, 0.5 * min(bias_error, value)))
+
+    @property
+    def per_e(self) -> float:
+        """How many grains bring texture down by e: spheres 4 (docs/hybrid.md), facets as many as forget a direction."""
+        forget = [max(LEAST_PER_E, 1.0 / max(1.0 - body.mean_cosine, 1e-9)) for body in self.bodies if not body.round]
+        return min([PER_E, *forget])
+
+    @property
+    def length(self) -> float:
+        """How many grains light meets that meets any, by the reference: with fewer still to come less can be missed."""
+        assert self.reference is not None
+        return max(self.pilots[self.reference].seen.events / max(self.coverage, 1e-9), 1.0)
+
+    @property
+    def lasting(self) -> float:
+        """How much of the light that has met any number of grains meets none any more, as a logarithm, if each may be
+        the last alike."""
+        return -math.log1p(-1.0 / max(self.length, 1.05))
+
+    def cost(self, candidate: Candidate) -> tuple[Seen, bool]:
+        """Return variance and time of a sample, by its pilot or from those of others, and whether it was the former.
+
+        Suns that only chance finds make as much more of the variance as they are smaller than in pilots: all of it, at
+        most, of single grains, and of levels whose grains let a share of light go exactly straight on, along which
+        nothing is aimed, that share of it.
+        """
+        seen, piloted = self.cost_of_pilots(candidate)
+        found = seen.variance
+        if not singly(candidate):
+            explicit = self.pilots.get(Candidate("explicit"))
+            all_of_it = self.of_reference(explicit).variance if explicit is not None and explicit.each else math.inf
+            straight = 0.0 if LEVELS[candidate.level].traits.points or not self.atoms else self.atoms * all_of_it
+            found = min(found, straight)
+        more = (self.rarer - 1.0) * found if self.rarer > 1.0 else 0.0
+        return seen._replace(variance=seen.variance + more), piloted
+
+    def cost_of_pilots(self, candidate: Candidate) -> tuple[Seen, bool]:
+        """Return the same of the lights that pilots are under."""
+        own = self.pilots.get(candidate)
+        assert self.reference is not None
+        best = self.of_reference(self.pilots[self.reference])
+        if self.hidden(candidate):
+            seen = self.of_reference(own) if own is not None and own.each else best
+            return seen._replace(variance=math.inf), own is not None
+        if own is not None and own.each:
+            return self.with_suns(own), True
+        level, k = candidate.level, candidate.explicit_grains
+        if level == "explicit":
+            return best._replace(seconds=self.explicit_sample), False
+        plain = self.pilots.get(Candidate(level))
+        near = next((self.pilots[Candidate(o)] for o in ("teleport-memory", "teleport", "volume")
+                     if Candidate(o) in self.pilots), None)  # fmt: skip
+        chain = self.of_reference(plain or near or self.pilots[self.reference])
+        if not k:
+            return chain, False
+        share = 1.0 - math.exp(-k * self.coverage / chain.events) if chain.events else 0.0
+        mixed = {
+            name: (1.0 - share) * getattr(chain, name) + share * getattr(best, name) for name in ("variance", "seconds")
+        }
+        return chain._replace(**mixed), False
+
+    def of_reference(self, pilot: Pilot) -> Seen:
+        """Return what a pilot saw, its variance over the mean of the reference squared, where that is to be believed:
+        errors are over the mean of the true picture, not of one that is too bright."""
+        assert self.reference is not None
+        seen, best = pilot.seen, self.pilots[self.reference]
+        if not (seen.mean > 0.0 and self.trusted(best)):
+            return seen
+        return seen._replace(variance=seen.variance * (seen.mean / best.seen.mean) ** 2)
+
+    def with_suns(self, pilot: Pilot) -> Seen:
+        """Return what a pilot saw; its variance is not less than lights that it has hardly met will make it."""
+        seen = self.of_reference(pilot)
+        if self.trusted(pilot):
+            return seen
+        return seen._replace(variance=max(seen.variance, 0.1 * self.coverage * self.chance))
+
+
+def singly(candidate: Candidate) -> bool:
+    """Return whether a candidate meets single grains, whose light is met by chance."""
+    return candidate.explicit_grains > 0 or LEVELS[candidate.level].traits.packed
