@@ -16,6 +16,7 @@ from tsdf.errors import TSDFError, UsageError
 from tsdf.grain.materials import optical_constants
 from tsdf.picture import image
 from tsdf.picture.image import read_environment, read_exr, spectral_weights, write_exr, write_png
+from tsdf.reference_data import make_observer
 
 PRINTED = np.get_printoptions()
 with warnings.catch_warnings():
@@ -39,10 +40,12 @@ def written(path, channels, **header):
 
 
 def test_colour_science_changes_nothing_else() -> None:
-    """Its import sets numpy's way of printing, on which other people's output and our golden files depend."""
+    """Its import sets numpy's way of printing, on which other people's output and our golden files depend; and takes
+    longer than a small picture, which needs nothing of it."""
     code = (
-        "import numpy as np; before = np.get_printoptions(); from tsdf.picture import image; image.spectral_weights(); "
-        "assert np.get_printoptions() == before"
+        "import sys, numpy as np; before = np.get_printoptions(); from tsdf.picture import image; "
+        "image.spectral_weights(); assert 'colour' not in sys.modules; image._colour(); "
+        "assert 'colour' in sys.modules and np.get_printoptions() == before"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -478,6 +481,13 @@ def test_white_stays_white():
     assert spectral_weights() is spectrum
     with pytest.raises(ValueError, match="read-only"):
         spectrum.weight[0, 0] = 0.0
+
+
+def test_observer_is_that_of_colour_science():
+    """The file that stands for the library is what its script makes, the matrix is the library's, to the last bit."""
+    assert "\n".join(make_observer.lines()) + "\n" == make_observer.OBSERVER.read_text(encoding="ascii")
+    matrix = colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB
+    assert np.array_equal(matrix, image.XYZ_TO_RGB)
 
 
 @pytest.mark.parametrize("metres", [0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0])
