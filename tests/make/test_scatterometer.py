@@ -214,7 +214,8 @@ def test_kill_loses_no_more_than_a_few_seconds(
     """A process killed without warning leaves a part file from which the build goes on to the same bytes."""
     out = tmp_path / "k.tsdf.exr"
     part = Path(f"{out}.part")
-    command = [sys.executable, "-c", "from tsdf.cli.build import main; main()", "octahedron", "--eta", "1.31"]
+    code = "from tsdf.make import scatterometer as s; s.SAVE_S = 0.1; from tsdf.cli.build import main; main()"
+    command = [sys.executable, "-c", code, "octahedron", "--eta", "1.31"]
     command += ["--paths", "1000000", "--quiet", "--threads", "1", "--out", str(out)]
     process = launch(command)
     while not part.exists() and process.poll() is None:
