@@ -182,6 +182,7 @@ class Build:
         errors = statistics.TableErrors(self.tally, self.effort.cells)
         progress.error = errors.fewest(target) or errors.rough()
         if progress.error.total_variation <= target:
+            self._latest = paths, progress.error
             progress.total = self.judgement = paths
             return True
         least, needed = (times * paths for times in errors.needed(target))

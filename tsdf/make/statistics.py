@@ -162,12 +162,13 @@ class TableErrors:
 
     def _estimate(self, cells: int) -> TableError:
         theta, replicates = self._theta, len(self._theta)
-        noise = columns_of(theta, cells).std(axis=0, ddof=1).sum()
+        columns = columns_of(theta, cells)
+        noise = columns.std(axis=0, ddof=1).sum()
         widths: list[float] = []
         for parts in (2, 4, 8, 16):
             if parts * cells > T.FINE:
                 break
-            width, blur = _width(theta[:, : T.FINE], cells, parts)
+            width, blur = _width(theta[:, : T.FINE], columns[:, -2:0:-1], parts)
             if widths and blur > 1.5 * width:
                 break
             widths.append(width)
@@ -227,15 +228,22 @@ class TableErrors:
         return least, math.sqrt(least * most) if math.isfinite(most) else least
 
 
-def _width(theta: np.ndarray, cells: int, parts: int) -> tuple[float, float]:
-    """Return the total variation between the columns and their `parts` nearly equal parts, and the parts' noise."""
-    replicates = len(theta)
+def _width(theta: np.ndarray, sums: np.ndarray, parts: int) -> tuple[float, float]:
+    """Return the total variation between columns and their `parts` nearly equal parts, and the parts' noise.
+
+    Parameters
+    ----------
+    theta : (replicates, FINE) float64
+    sums : (replicates, cells) float64
+        Of `theta` over each column.
+    """
+    replicates, cells = sums.shape
     edges = bounds(cells, T.FINE)
     cuts = np.append(np.rint(np.linspace(edges[:-1], edges[1:], parts, endpoint=False)).astype(int).T.ravel(), T.FINE)
     deviations = np.add.reduceat(theta, cuts[:-1], axis=1).reshape(replicates, cells, parts)
     share = np.diff(-np.cos(cuts * (math.pi / T.FINE))).reshape(cells, parts)
     share /= share.sum(axis=1, keepdims=True)  # the density of the table is uniform in cos theta within a column
-    deviations -= np.add.reduceat(theta, edges[:-1], axis=1)[:, :, None] * share
+    deviations -= sums[:, :, None] * share
     mean = deviations.mean(axis=0)
     deviations -= mean
     variances = np.square(deviations, out=deviations).sum(axis=0) / ((replicates - 1) * replicates)
