@@ -17,7 +17,8 @@ from click.testing import CliRunner, Result
 
 from tsdf.cli import common
 from tsdf.cli.render import main
-from tsdf.picture import image
+from tsdf.errors import TSDFError
+from tsdf.picture import image, world
 from tsdf.reference_data.make_checks import CHECKS
 
 WIDTH, HEIGHT = 12, 8
@@ -243,6 +244,24 @@ def test_an_interrupt_before_anything_ends_at_once(
     assert process.returncode == 128 + number
     assert said == "" and rest.count("\n") == 1 and rest.startswith("tsdf-render: error: interrupted")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_getting_ready_leaves_nothing_to_keep(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However far the records for leaps are: an interrupt then ends at once, and not after a minute of compiling."""
+    works: list[common.Work] = []
+
+    class Known(common.Work):
+        def __init__(self, progress: common.Progress) -> None:
+            super().__init__(progress)
+            works.append(self)
+
+    def build(*_: object, progress: Callable[[float, str], None], **__: object) -> None:
+        progress(0.9, "records for leaps")
+        raise TSDFError(f"an interrupt means: {works[0].meaning()}")
+
+    monkeypatch.setattr(common, "Work", Known)
+    monkeypatch.setattr(world, "build", build)
+    assert run(folder).stderr.endswith("an interrupt means: nothing is written\n")
 
 
 def test_progress(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
