@@ -322,7 +322,7 @@ def embree_scene(grain: Grain) -> Any:
 
 
 def triangle_scene(vertices: ArrayLike, faces: ArrayLike, name: str = "mesh") -> Any:
-    """Return the robust Embree scene of any triangles, as `embree_scene` does for a grain's."""
+    """Return the robust Embree scene of any triangles, as `embree_scene` does for a grain's; threads may share it."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
@@ -334,6 +334,7 @@ def triangle_scene(vertices: ArrayLike, faces: ArrayLike, name: str = "mesh") ->
         raise GrainError(f"{name}: the mesh is damaged; make it by grain_from_mesh")
     scene = EmbreeScene(robust=True)
     TriangleMesh(scene, corners, triangles)  # copied into the scene, which owns it
+    scene.run(corners[:1], np.ones((1, 3), np.float32))  # builds its tree, so that threads can share it
     return scene
 
 

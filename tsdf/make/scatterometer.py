@@ -296,7 +296,7 @@ class Build:
                     reflectance_scale)  # fmt: skip
         tracing.set()
         under_way: deque[Round] = deque()
-        pace, ahead, before = Pace(deadline), self.done, time.monotonic()
+        pace, ahead, before = Pace(deadline, CHUNK_MIN * max(1, threads // 2)), self.done, time.monotonic()
         saved = before
         with crew:
             while True:
