@@ -35,7 +35,7 @@ from tsdf.vectors import KERNEL, dot, frame, minus, renewed, step, triple
 SPLIT = 0.6  # a part lighter than this share of the light that enters is raised to it at random
 FAN = 4  # directions in which a facet is lit from one point, half as many in a grain that shades itself
 OPEN = 0.9  # share of the light that comes in above the horizon of a grain that does not
-SLOTS = 2048  # rays under way at once, per thread, but for splitting: their state stays in the second-level cache
+SLOTS = 4096  # rays under way at once, per thread, but for splitting: few enough for the cache, a millisecond of work
 MAX_BOUNCES = 100_000  # default bounce limit
 # A ray under way: where it starts and goes, the length inside so far, the light that entered, its random key and path,
 # the facet it starts from, hits so far
