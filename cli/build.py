@@ -356,9 +356,12 @@ def trace(
     TSDFError
     """
 
+    from tsdf.data.format import get_ready
+
     def meaning() -> str | None:
         return None if build.done else "nothing is done yet"
 
+    beside(get_ready)
     try:
         with interruptible(meaning, raises=True):
             with shown_progress(quiet) as progress:
