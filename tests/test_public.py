@@ -16,6 +16,7 @@ TEXT = (Path(__file__).parent / "ball.toml").read_text()
 SCENE = {**tomllib.loads(TEXT), "render": {"spp": 2, "seed": 5, "level": "volume"}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [("sphere", "--cells", "32"), ("cube", "--paths", "5000", "--joint", "2")])
 def test_build_makes_what_the_command_makes(words: tuple[str, ...], tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as done:

@@ -299,6 +299,7 @@ def test_a_reader_who_is_gone_costs_no_result(monkeypatch: pytest.MonkeyPatch) -
         progress.note("note")
 
 
+@pytest.mark.slow
 def test_level_auto(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A scene without a level is planned: what is taken, why, and what fixes it is said once, and is in the file; the
     command that is named makes the same picture. With a level nothing is planned."""

@@ -39,6 +39,7 @@ def written(path, channels, **header):
 # ------------------------------------------------------------------------------------------------ EXR
 
 
+@pytest.mark.slow
 def test_colour_science_changes_nothing_else() -> None:
     """Its import sets numpy's way of printing, on which other people's output and our golden files depend; and takes
     longer than a small picture, which needs nothing of it."""
@@ -388,6 +389,7 @@ def test_other_primaries_are_converted(tmp_path):
     assert "makes no sense" in read(0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3).notes[0]
 
 
+@pytest.mark.slow
 def test_small_files_of_many_pixels_are_refused_before_they_are_read(tmp_path):
     """A black image of 8192 x 4096 pixels is a small file that would take gigabytes as an environment."""
     path = written(tmp_path / "sky.exr", dict.fromkeys("RGB", np.zeros((4096, 8192), np.float16)))

@@ -53,6 +53,7 @@ def room(hole):
     return Scene(CAMERA, ONE, (), tuple(SurfaceSpec(side, (1.0, 1.0, 1.0)) for side in sides), name="room")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [CUBE, Sphere((0.5, 0.0, 0.0), 3.0), "mesh", "room"])
 def test_a_camera_shut_in_by_white_walls_is_refused(shape, tmp_path):
     """Paths there would never end. Walls that absorb end them, and the picture is black; a room with a hole and a
@@ -81,6 +82,7 @@ def heap(ball, radius, shape=CUBE, camera=None, absorption=0.0):
     return Scene(camera, ONE, (MediumSpec(shape, 0.5, radius, (grain,), "heap"),), name="heap")
 
 
+@pytest.mark.slow
 def test_grains_too_small_for_their_medium_are_refused(ball):
     """Grains of 1e-12 in a box of 4: a path without leaps would meet 1e12. Where they absorb, paths end, and the scene
     is built; from 1e5 grains on a note says how long it takes."""
