@@ -211,6 +211,7 @@ def quadrature(n, constant, environment, rotation_deg, suns, fine=60):
     return total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [(0.0, 0.0, 1.0), (0.6, -0.48, 0.64), (-0.36, 0.48, -0.8)])
 def test_every_route_to_the_irradiance_agrees(n):
     """Draws, uniform directions, both weighted, and quadrature agree within 4.5 standard errors of the data.
