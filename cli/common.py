@@ -114,6 +114,8 @@ class Tool(click.Command):
         except Exception as error:
             if os.environ.get("TSDF_DEBUG"):
                 raise
+            if "start new thread" in str(error):  # there is no room for its stack
+                return self._tell("error", "not enough memory", 1)
             hint = "this is a bug, please report it with the traceback that TSDF_DEBUG=1 shows"
             return self._tell("error", f"{type(error).__name__}: {error}; {hint}", 1)
 
