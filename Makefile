@@ -90,7 +90,7 @@ frontier: .venv/installed  ## measure error against processor time in seven scen
 		scenes/frontier/deep.toml scenes/frontier/close.toml scenes/frontier/mixture.toml scenes/frontier/buried.toml \
 		--out frontier $(if $(SECONDS),--seconds $(SECONDS))
 	$(BIN)/python benchmarks/bench_building.py sphere --out frontier
-	@echo "docs/frontier.md reads the charts aloud; benchmarks/bench_peers.py puts Mitsuba on them"
+	@echo "docs/frontier.md reads the charts aloud; benchmarks/bench_peers.py puts other renderers on them"
 
 bench: .venv/installed  ## measure speed and error side by side, into bench/
 	$(BIN)/python benchmarks/bench.py

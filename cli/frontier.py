@@ -43,6 +43,11 @@ MOST_GRAINS = 1_000_000
 @click.option(
     "--grains", metavar="K,K,..", help="Explicit grains before chains of grains, each a candidate.  [default: 0,3,8]"
 )
+@click.option(
+    "--leaps", metavar="G,G,..",
+    help="Least radius of leaps [transport mean free paths], each a candidate of the levels that leap; 0 for none.  "
+    "[default: as the scene says]",
+)  # fmt: skip
 @click.option("--seconds", type=float, metavar="S", help="Time of each scene, by the clock.  [default: 240]")
 @click.option("--runs", callback=whole_number, metavar="N", help="Independent runs, a packing each.  [default: 10]")
 @click.option("--width", type=int, metavar="PIXELS", help="Width of the pictures; their shape is kept.")
@@ -50,8 +55,8 @@ MOST_GRAINS = 1_000_000
 @threads_option
 @click.option("--quiet", is_flag=True, help="No progress bar, no report.")
 def main(
-    scenes: tuple[Path, ...], out: Path, levels: str | None, grains: str | None, seconds: float | None,
-    runs: int | None, width: int | None, seed: int | None, threads: int | None, quiet: bool,
+    scenes: tuple[Path, ...], out: Path, levels: str | None, grains: str | None, leaps: str | None,
+    seconds: float | None, runs: int | None, width: int | None, seed: int | None, threads: int | None, quiet: bool,
 ) -> int:  # fmt: skip
     """Measure every way to render each SCENE, a TOML file, against single grains: error against processor time.
 
@@ -62,11 +67,11 @@ def main(
     cannot be meant.
     """
     chosen = named_levels(levels, LEVELS)
-    explicit = _grains(grains)
+    explicit, radii = _grains(grains), _leaps(leaps)
     check_numbers(seed, runs=runs, width=width, threads=threads)
     asked = {
-        "levels": levels, "grains": grains, "seconds": seconds, "runs": runs, "width": width, "seed": seed,
-        "threads": threads,
+        "levels": levels, "grains": grains, "leaps": leaps, "seconds": seconds, "runs": runs, "width": width,
+        "seed": seed, "threads": threads,
     }  # fmt: skip
     vain = [f"--{name}" for name, value in asked.items() if value is not None]
     if vain and all(scene.suffix == SAVED for scene in scenes):
@@ -79,6 +84,7 @@ def main(
     from tsdf.scene.specs import files_of
     from tsdf.study import frontier, frontier_files
     from tsdf.study.candidates import candidates
+    from tsdf.study.frontier import leaping
 
     saved = {scene: frontier_files.read(scene) for scene in scenes if scene.suffix == SAVED}
     read = {scene: resized(load(scene), width) for scene in scenes if scene not in saved}
@@ -102,7 +108,7 @@ def main(
             if one is None:
                 own = read[scene]
                 one = frontier.measure(
-                    own, candidates(chosen, explicit), frontier.SECONDS if seconds is None else seconds,
+                    own, leaping(candidates(chosen, explicit), radii), frontier.SECONDS if seconds is None else seconds,
                     frontier.RUNS if runs is None else runs, own.render.seed if seed is None else seed, threads, told,
                     work.stop,
                 )  # fmt: skip
@@ -173,3 +179,25 @@ def _grains(text: str | None) -> list[int]:
             raise UsageError(f"--grains are whole numbers from 0 to {MOST_GRAINS}, as 0,3,8, not {plain(text)}")
         found.append(int(word))
     return sorted(set(found))
+
+
+def _leaps(text: str | None) -> list[float | None]:
+    """Return the radii G,G,.. of --leaps; what the scene says where nothing is said.
+
+    Raises
+    ------
+    UsageError
+    """
+    if text is None:
+        return [None]
+    from tsdf.picture.leaping import checked
+
+    found: list[float | None] = []
+    for word in text.split(","):
+        try:
+            radius = float(word)
+        except ValueError:
+            raise UsageError(f"--leaps are numbers, as 0,2,4, not {plain(text)}") from None
+        checked(radius, "--leaps")
+        found.append(radius)
+    return found

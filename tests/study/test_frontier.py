@@ -163,7 +163,7 @@ def test_noise_and_bias_are_taken_apart(ball: Scene) -> None:
     way = frontier.Way(Candidate("volume"), build(ball, "volume"), 0)
     way.runs = [picture(1.0 + pattern + 0.1 * left[..., None]) for _ in truths]
     way.grown = [[(1.0, square(one, truth, False, 1.0))] for one, truth in zip(way.runs, truths, strict=True)]
-    row = frontier._measured(way, truths, {"whole": np.ones_like(left), "left": left}, 1.0)
+    row = frontier.numbers(way, truths, {"whole": np.ones_like(left), "left": left}, 1.0)
     expected = {"whole": 0.05, "left": 0.1}
     for name, value in expected.items():
         assert abs(mean_of(row.bias[name]).value - value) < SIGMAS * mean_of(row.bias[name]).error < 0.02
@@ -184,12 +184,29 @@ def test_runs_share_no_random_numbers_but_packings(ball: Scene) -> None:
         for step in range(frontier.DOUBLINGS + 1)
     }
     assert len(streams) == (1 + len(ways)) * 10 * (frontier.DOUBLINGS + 1)
-    packings = frontier._Packings(ball)
+    packings = frontier.Packings(ball)
     worlds = [build(taken(ball, c), c.level) for c in (Candidate("explicit"), Candidate("teleport", 2))]
     first, second = ([packings.of(world, run).packed for world in worlds] for run in (0, 1))
     assert first[0] is first[1] and second[0] is second[1]
     own = worlds[0].packed.arrays.centres[0]
     assert np.array_equal(first[0].arrays.centres[0], own) and not np.array_equal(second[0].arrays.centres[0], own)
+
+
+def test_leaps_are_candidates_of_the_levels_that_leap(ball: Scene) -> None:
+    """Each radius once, smallest first, none before those of the scene; explicit grains never leap. In a ball too small
+    for them all are the same level, told apart by name, line and random numbers."""
+    chosen = frontier.leaping(candidates(("explicit", "teleport"), (0, 2)), [4.0, 0.0, 4.0])
+    names = ["explicit", "teleport k=2 leap=0", "teleport k=2 leap=4", "teleport leap=0", "teleport leap=4"]
+    assert [str(one) for one in chosen] == names
+    assert frontier.leaping(chosen[:1], [None]) == chosen[:1]
+    made = frontier.measure(ball, chosen, seconds=0.3, runs=2, threads=1)
+    assert made is not None and [str(row.candidate) for row in made.rows] == names
+    assert made.rows[-1].noise != made.rows[-2].noise
+    figure = frontier_plots.plot_frontier(made)
+    shown = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert shown[-2:] == ["no leaps", "leaps from 4 on"]
+    widths = {line.get_linewidth() for line in figure.axes[0].get_lines() if len(line.get_xdata()) > 20}
+    assert len(widths) >= 2
 
 
 def test_bytes_are_of_what_a_level_draws_from(found: Frontier) -> None:
@@ -210,12 +227,35 @@ def test_impossible_candidates_are_said(ball: Scene) -> None:
     made = frontier.measure(tight, chosen, seconds=0.2, runs=2, threads=1)
     assert made is not None and made.truth == "teleport"
     assert [str(row.candidate) for row in made.rows] == ["teleport", "volume"]
-    assert any(note.startswith("explicit cannot be the truth: ") for note in made.notes)
-    assert any(note.startswith("left out: teleport k=2: ") for note in made.notes)
+    assert sum(note.startswith("left out: explicit, teleport k=2: ") for note in made.notes) == 1
     text = frontier_files.markdown(made)
-    assert "Truth: teleport, " in text and "left out: teleport-joint k=2, teleport-joint: " in text
+    assert "Truth: teleport, " in text and "Not grain by grain" in text
+    assert "left out: teleport-joint, teleport-joint k=2: " in text
     with pytest.raises(UsageError, match="none of teleport-joint is possible"):
         frontier.measure(loose, [Candidate("teleport-joint")], seconds=0.2, runs=2)
+
+
+def test_no_level_that_meets_a_small_sun_by_chance_is_believed(ball: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Under a small sun the truth is the best level that aims at it, and what has explicit grains is left out, once.
+
+    Control: a wide sun leaves nothing out. A level that alone was asked for and cannot be had is an error.
+    """
+    chosen = candidates(("explicit", "teleport", "volume"), (0, 2))
+    monkeypatch.setattr(frontier, "_affordable", lambda *_: 64)
+
+    def under(diameter_deg: float) -> Scene:
+        return replace(ball, lights=(SunLight((0.0, 0.0, 1.0), (1.0, 1.0, 1.0), diameter_deg),))
+
+    made = frontier.measure(under(0.53), chosen, runs=2, threads=1)
+    assert made is not None and made.truth == "teleport-memory"
+    assert [str(row.candidate) for row in made.rows] == ["teleport", "volume"]
+    left = [note for note in made.notes if note.startswith("left out: ")]
+    assert len(left) == 1 and left[0].startswith("left out: explicit, teleport-packed, teleport k=2: ")
+    assert not any(note.startswith("ball: level explicit meets") for note in made.notes)
+    wide = frontier.measure(under(60.0), chosen, runs=2, threads=1)
+    assert wide is not None and wide.truth == "explicit" and len(wide.rows) == len(chosen)
+    with pytest.raises(UsageError, match="none of explicit is possible"):
+        frontier.measure(under(0.53), [Candidate("explicit")], runs=2, threads=1)
 
 
 def test_a_furnace_has_no_error_and_no_noise(ball: Scene, tmp_path: Path) -> None:
@@ -446,6 +486,9 @@ def test_command_writes_results_and_draws_them_again(tmp_path: Path, capsys: pyt
         (["scene.toml", "--out", "o", "--levels", "teleprot"], 2, "did you mean teleport"),
         (["scene.toml", "--out", "o", "--grains", "1,-2"], 2, "--grains"),
         (["scene.toml", "--out", "o", "--grains", "1.5"], 2, "--grains"),
+        (["scene.toml", "--out", "o", "--leaps", "0,x"], 2, "--leaps"),
+        (["scene.toml", "--out", "o", "--leaps", "0.5"], 2, "--leaps"),
+        (["scene.toml", "--out", "o", "--leaps", "nan"], 2, "--leaps"),
         (["scene.toml", "--out", "o", "--runs", "1"], 2, "--runs is"),
         (["scene.toml", "--out", "o", "--seconds", "0"], 2, "--seconds is"),
         (["empty.json", "--out", "o", "--levels", "volume", "--seed", "0"], 2, "--levels, --seed: saved results"),

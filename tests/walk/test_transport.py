@@ -227,6 +227,19 @@ def test_furnace_of_traced_grains(level, folder, cube):
     assert abs(mean - 1.0) <= max(4.0 * error, 1e-12)
 
 
+@pytest.mark.parametrize("level", ["teleport", "teleport-joint", "teleport-memory", "volume"])
+def test_no_sample_outshines_the_light(level, ball):
+    """In constant light of radiance 1 no sample is above 1, whatever the grains absorb: a survivor of the roulette has
+    what it had before at most, and a jump that a boundary cuts short has lost less than the roulette was told. Those
+    that are above a third, and thus have survived or are not dim, show that there was something to bound."""
+    grain = GrainSpec(ball, absorption=Absorption("grey", (3.0,)))
+    scene = Scene(replace(OUTSIDE, width=96, height=72), ONE, (MediumSpec(BOX, 0.5, 1.0, (grain,), inside="centres"),))
+    picture = render.render(world.build(scene, level), spp=1)
+    inside = picture.rgb[picture.rgb < 0.999]
+    assert picture.rgb.max() <= 1.0 + 1e-9
+    assert inside.size > 1000 and inside.max() > 0.3
+
+
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("what", ["ball", "box", "mesh", "floor", "cut"])
 def test_furnace_with_white_surfaces(what, level, folder, ball):

@@ -23,6 +23,7 @@ from tsdf.data.table import Table
 from tsdf.errors import TSDFError, UsageError
 from tsdf.picture import render
 from tsdf.picture.render import Picture
+from tsdf.picture.trust import SHOWN, kurtosis_of
 from tsdf.picture.world import World, build, sees
 from tsdf.scene.levels import LEVELS
 from tsdf.scene.scene import Scene
@@ -39,6 +40,7 @@ TRIAL = 0.1  # share of a run's time after which a trial says how many samples i
 DOUBLINGS = 4  # of the samples of a run, at which its error is measured
 LEAST_SAMPLES = 2  # of a pixel, for one has no variance
 MOST_PIXELS = 20_000_000  # of all pictures, which are in memory until the end: a gigabyte
+MEETINGS = 1.0 / SHOWN  # of lights that only chance finds, below which a picture of them is not believed
 UNSURE = 0.2  # relative noise of the truth's pixels in a run, from which on the user is told
 LARGEST_SEED = 2**63
 
@@ -164,15 +166,14 @@ class Frontier:
         return row.candidate == Candidate(self.truth)
 
     def squares(self) -> np.ndarray:
-        """Return (candidates, runs) the squared floors of each run, 0 for the truth's own level."""
-        return np.array([np.zeros(self.runs) if self.exact(row) else row.squares for row in self.rows])
+        """Return (candidates, runs) the squared floors of each run, 0 for the truth's own level; those of a candidate
+        whose mean comes out below zero, which it cannot be, are moved there."""
+        squares = np.array([np.zeros(self.runs) if self.exact(row) else row.squares for row in self.rows])
+        return squares - np.minimum(squares.mean(axis=1, keepdims=True), 0.0)
 
     def squared_errors(self, seconds: float) -> np.ndarray:
-        """Return (candidates, runs) the squared errors after so much processor time [s]; floors that come out below
-        zero by chance are taken as zero."""
-        squares = self.squares()
-        squares -= np.minimum(squares.mean(axis=1, keepdims=True), 0.0)
-        return squares + np.array([row.noise_seconds for row in self.rows]) / seconds
+        """Return (candidates, runs) the squared errors after so much processor time [s]."""
+        return self.squares() + np.array([row.noise_seconds for row in self.rows]) / seconds
 
     def biases(self) -> np.ndarray:
         """Return (candidates, runs) the bias of the whole in each run, 0 for the truth's own level."""
@@ -221,10 +222,11 @@ def measure(
     if not 0.0 < seconds < math.inf:
         raise UsageError(f"--seconds is a finite number above 0, not {seconds}")
     stop, told = stop or threading.Event(), progress or (lambda share, word: None)
-    notes: list[str] = []
     told(0.0, "reading the scene")
-    truth = _truth(scene, notes)
-    ways = _possible(scene, candidates() if chosen is None else chosen, truth, notes, told, stop)
+    sized = Sizing(seconds / runs, runs, seed, threads, stop)
+    left = Left()
+    truth = truth_of(scene, sized, left)
+    ways = possible(scene, candidates() if chosen is None else chosen, truth, left, told, stop)
     if stop.is_set():
         return None
     if not sees(truth.world):
@@ -236,11 +238,11 @@ def measure(
             "memory; give a smaller --width, which is sooner as well"
         )
     told(0.0, "trying how long samples take")
-    each = seconds / runs
-    for way in (truth, *ways):
-        share = TRUTH if way is truth else (1.0 - TRUTH) / len(ways)
-        way.samples = _affordable(way.world, share * each, seed, threads, stop)
-    packings = _Packings(scene)
+    truth.samples = sized.of(truth.world, TRUTH)
+    ways = seeing(scene, ways, sized, 1.0 - TRUTH, left)
+    if stop.is_set():
+        return None
+    packings = Packings(scene)
     for run in range(runs):
         for number, way in enumerate((truth, *ways)):
             if stop.is_set():
@@ -251,7 +253,7 @@ def measure(
         if stop.is_set():
             break
     done = min(len(way.runs) for way in (truth, *ways))
-    return _summed(scene, truth, ways, done, runs, seed, notes) if done >= LEAST_RUNS else None
+    return summed(scene, truth, ways, done, sized, left) if done >= LEAST_RUNS else None
 
 
 # --------------------------------------------------------------------------------------------- rendering
@@ -294,7 +296,7 @@ class Way:
         self.grown.append(grown)
 
 
-class _Packings:
+class Packings:
     """The packings of each run, made when they are asked for and only as long as it lasts."""
 
     def __init__(self, scene: Scene) -> None:
@@ -319,8 +321,51 @@ def _repacked(scene: Scene, k: int) -> Scene:
     return replace(scene, media=media)
 
 
-def _truth(scene: Scene, notes: list[str]) -> Way:
-    """Return the best level that is possible; why not the better ones goes to the notes."""
+@dataclass(frozen=True)
+class Sizing:
+    """What the number of samples follows: time of a run by the clock [s], runs, and how they are rendered."""
+
+    seconds: float
+    runs: int
+    seed: int
+    threads: int | None
+    stop: threading.Event
+
+    def of(self, world: World, share: float) -> int:
+        """Return how many samples of a pixel fit into a share of a run."""
+        return _affordable(world, share * self.seconds, self.seed, self.threads, self.stop)
+
+    def blind(self, world: World, samples: int) -> bool:
+        """Return whether all runs together meet suns and small bright lights too seldom, for a world that finds them by
+        chance alone."""
+        if not (world.media.singles and world.scene.media and world.lights.sampled) or self.stop.is_set():
+            return False
+        camera = world.scene.camera
+        met = samples * self.runs * camera.width * camera.height / kurtosis_of(world.lights)
+        return met < MEETINGS
+
+
+class Left(dict[str, list[str]]):
+    """What is left out, by the reason why."""
+
+    def add(self, reason: str, name: str) -> None:
+        names = self.setdefault(reason, [])
+        if name not in names:
+            names.append(name)
+
+    def notes(self) -> list[str]:
+        """Return a line for each reason."""
+        return [f"left out: {', '.join(names)}: {reason}" for reason, names in self.items()]
+
+
+BLIND = (
+    f"light from suns and small bright lights would be met by chance alone, less than {MEETINGS:g} times in all runs, "
+    "and neither the picture nor its noise be known; widen them by a smooth sky, or give more seconds"
+)
+
+
+def truth_of(scene: Scene, sized: Sizing, left: Left) -> Way:
+    """Return the best level that is possible and meets the lights."""
     failed: TSDFError | None = None
     for level in LEVELS:
         candidate = Candidate(level)
@@ -328,12 +373,36 @@ def _truth(scene: Scene, notes: list[str]) -> Way:
             world = build(taken(scene, candidate), level)
         except TSDFError as error:
             failed = failed or error
-            notes.append(f"{level} cannot be the truth: {error}")
+            left.add(str(error), str(candidate))
             continue
-        notes += world.notes
+        if sized.blind(world, LEAST_SAMPLES) and sized.blind(world, sized.of(world, TRUTH)):
+            left.add(BLIND, str(candidate))
+            continue
         return Way(candidate, world, 0)
-    assert failed is not None
-    raise failed
+    raise failed or UsageError(f"{scene.name}: {BLIND}")
+
+
+def seeing(scene: Scene, ways: Sequence[Way], sized: Sizing, share: float, left: Left) -> list[Way]:
+    """Return the candidates that meet the lights in as many samples as they are given here, all together in a share of
+    a run."""
+    found = []
+    for way in ways:
+        way.samples = sized.of(way.world, share / len(ways))
+        if sized.blind(way.world, way.samples):
+            left.add(BLIND, str(way))
+        else:
+            found.append(way)
+    if not found and not sized.stop.is_set():
+        raise UsageError(f"{scene.name}: none of {', '.join(map(str, ways))} is possible: {BLIND}")
+    return found
+
+
+def leaping(chosen: Sequence[Candidate], leaps: Sequence[float | None]) -> tuple[Candidate, ...]:
+    """Return candidates with each of these least radii of leaps, smallest first; once where a level cannot leap."""
+    radii = sorted(set(leaps), key=lambda leap: -1.0 if leap is None else leap)
+    return tuple(
+        one._replace(leap=leap) for one in chosen for leap in (radii if LEVELS[one.level].traits.leaps else (None,))
+    )
 
 
 def stream_of(candidate: Candidate) -> int:
@@ -344,13 +413,13 @@ def stream_of(candidate: Candidate) -> int:
     return stream
 
 
-def _possible(
-    scene: Scene, chosen: Sequence[Candidate], truth: Way, notes: list[str], told: Callable[[float, str], None],
+def possible(
+    scene: Scene, chosen: Sequence[Candidate], truth: Way, left: Left, told: Callable[[float, str], None],
     stop: threading.Event,
 ) -> list[Way]:  # fmt: skip
-    """Return the candidates that are possible; why the others are not goes to the notes, once for each reason."""
+    """Return the candidates that can be made ready."""
     ways: list[Way] = []
-    failed: dict[str, list[str]] = {}
+    why = ""
     for candidate in chosen:
         if stop.is_set():
             return ways
@@ -360,13 +429,12 @@ def _possible(
             if candidate != truth.candidate:
                 world = build(taken(scene, candidate), candidate.level)
         except TSDFError as error:
-            failed.setdefault(str(error), []).append(str(candidate))
+            why = why or str(error)
+            left.add(str(error), str(candidate))
             continue
         ways.append(Way(candidate, world, stream_of(candidate)))
-        notes += [note for note in world.notes if note not in notes]
-    notes += [f"left out: {', '.join(names)}: {error}" for error, names in failed.items()]
     if not ways:
-        raise UsageError(f"{scene.name}: none of {', '.join(map(str, chosen))} is possible: {next(iter(failed))}")
+        raise UsageError(f"{scene.name}: none of {', '.join(map(str, chosen))} is possible: {why}")
     return ways
 
 
@@ -403,9 +471,7 @@ def _affordable(world: World, seconds: float, seed: int, threads: int | None, st
 # ----------------------------------------------------------------------------------------------- numbers
 
 
-def _summed(
-    scene: Scene, truth: Way, ways: Sequence[Way], runs: int, asked: int, seed: int, notes: list[str]
-) -> Frontier:
+def summed(scene: Scene, truth: Way, ways: Sequence[Way], runs: int, sized: Sizing, left: Left) -> Frontier:
     """Return the numbers of so many runs."""
     references = truth.runs[:runs]
     mean_picture = np.mean([picture.rgb for picture in references], axis=0)
@@ -420,25 +486,26 @@ def _summed(
         )
     if truth.doubts:
         said.append(f"the truth's own errors cannot be trusted in {len(truth.doubts)} runs: {truth.doubts[0]}")
-    if (done := min(runs, asked)) < asked:
-        said.append(f"interrupted: {done} of {asked} runs")
+    if runs < sized.runs:
+        said.append(f"interrupted: {runs} of {sized.runs} runs")
+    notes = dict.fromkeys(note for way in (truth, *ways) for note in way.world.notes)
     return Frontier(
         scene=scene.name,
         width=scene.camera.width,
         height=scene.camera.height,
-        seed=seed,
+        seed=sized.seed,
         truth=truth.candidate.level,
         truth_samples=truth.samples,
         truth_seconds=tuple(picture.processor_seconds for picture in references),
         truth_noise=noise,
         regions={name: float(mask.mean()) for name, mask in masks.items()},
-        rows=tuple(_measured(way, references, masks, scale) for way in ways),
-        notes=(*notes, *said),
-        asked=asked,
+        rows=tuple(numbers(way, references, masks, scale) for way in ways),
+        notes=(*notes, *left.notes(), *said),
+        asked=sized.runs,
     )
 
 
-def _measured(way: Way, references: Sequence[Picture], masks: Mapping[str, np.ndarray], scale: float) -> Measured:
+def numbers(way: Way, references: Sequence[Picture], masks: Mapping[str, np.ndarray], scale: float) -> Measured:
     """Return the numbers of a candidate."""
     ends = way.runs[: len(references)]
     pairs = list(zip(ends, references, strict=True))

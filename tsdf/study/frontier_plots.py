@@ -18,6 +18,7 @@ from tsdf.study.plots import STYLE, literal
 from tsdf.study.ranking import mean_of
 
 LINES: Any = ("-", "--", ":", "-.")  # by the number of explicit grains, fewest first
+WIDTHS = (1.1, 2.4, 0.5)  # of lines, by the least radius of leaps, as the scene says first
 ONWARD = 30.0  # how much farther than the measured times a line goes
 COLUMNS = 3  # of charts beside each other
 STEPS = {1.2: (1.0, 1.5, 2.0, 3.0, 5.0, 7.0), 2.2: (1.0, 2.0, 5.0), 3.5: (1.0, 3.0)}  # of a decade, by decades shown
@@ -74,7 +75,7 @@ def _against_time(axes: Any, frontier: Frontier) -> None:
         seconds = np.geomspace(low, high, 200)
         error = np.sqrt((floor.value**2 if floor.seen else 0.0) + noise / seconds)
         known = error > (0.0 if floor.seen else floor.high)  # below the limit nobody knows
-        axes.plot(seconds[known], 100.0 * error[known], _line(frontier, row), linewidth=1.1, **style)
+        axes.plot(seconds[known], 100.0 * error[known], _line(frontier, row), linewidth=_width(frontier, row), **style)
         if not floor.seen and known.any() and floor.high > 0.0:
             end = seconds[known][-1]
             axes.annotate(
@@ -130,14 +131,18 @@ def _against_bytes(axes: Any, frontier: Frontier) -> None:
     """Draw floors over the bytes that a candidate draws from."""
     axes.set_xscale("log")
     axes.set_yscale("log")
-    shown = []
     fills = dict(zip(_singles([frontier]), ("full", "none", "left", "bottom"), strict=False))
-    for row in frontier.rows:
+    drawn = [row for row in frontier.rows if not frontier.exact(row) and row.floor.high > 0.0]
+    if drawn:  # first, for an arrow alone has no width to be laid out by
+        tops = [100.0 * row.floor.high for row in drawn]
+        feet = [100.0 * (max(f.low, 0.5 * f.high) if f.seen else 0.7 * f.high) for f in (row.floor for row in drawn)]
+        axes.set_ylim(0.7 * min(feet), 1.4 * max(tops))
+        sizes = [row.bytes / 1000.0 for row in frontier.rows]
+        axes.set_xlim(min(sizes) / 2.0, 2.0 * max(sizes))
+    for row in drawn:
         value, low, high = (100.0 * x for x in row.floor[:3])
         level = LEVELS[row.candidate.level]
         kilobytes = row.bytes / 1000.0
-        if frontier.exact(row) or not high > 0.0:
-            continue
         if row.floor.seen:
             axes.errorbar(
                 kilobytes, value, [[value - max(low, 1e-9)], [high - value]], fmt=level.mark, markersize=5, capsize=2,
@@ -147,11 +152,6 @@ def _against_bytes(axes: Any, frontier: Frontier) -> None:
             axes.errorbar(
                 kilobytes, high, 0.25 * high, fmt="none", uplims=True, capsize=3, elinewidth=0.8, color=level.colour
             )
-        shown += [high, max(low, 0.5 * high) if row.floor.seen else 0.7 * high]
-    if shown:
-        axes.set_ylim(0.7 * min(shown), 1.4 * max(shown))
-        sizes = [row.bytes / 1000.0 for row in frontier.rows]
-        axes.set_xlim(min(sizes) / 2.0, 2.0 * max(sizes))
     _decades(axes)
     axes.set_xlabel("kilobytes that are drawn from")
     axes.set_ylabel("floor: what time does not mend [%], arrows: below")
@@ -183,8 +183,19 @@ def _line(frontier: Frontier, row: Measured) -> Any:
     return LINES[min(_singles([frontier]).index(row.candidate.explicit_grains), len(LINES) - 1)]
 
 
+def _leaps(frontiers: Sequence[Frontier]) -> list[float]:
+    """Return the least radii of leaps that candidates name."""
+    leaps = {row.candidate.leap for frontier in frontiers for row in frontier.rows}
+    return sorted(leap for leap in leaps if leap is not None)
+
+
+def _width(frontier: Frontier, row: Measured) -> float:
+    leap = row.candidate.leap
+    return WIDTHS[0 if leap is None else min(_leaps([frontier]).index(leap), len(WIDTHS) - 1)]
+
+
 def _keys(frontiers: Sequence[Frontier]) -> list[Any]:
-    """Return what the legend shows: colours and marks are levels, lines are explicit grains."""
+    """Return what the legend shows: colours and marks are levels, lines are explicit grains, their widths leaps."""
     from matplotlib.lines import Line2D
 
     shown = {row.candidate.level for frontier in frontiers for row in frontier.rows}
@@ -196,5 +207,10 @@ def _keys(frontiers: Sequence[Frontier]) -> list[Any]:
     keys += [
         Line2D([], [], color="0.3", linestyle=LINES[min(n, len(LINES) - 1)], label=f"{k} explicit grains first")
         for n, k in enumerate(singles) if k
+    ]  # fmt: skip
+    keys += [
+        Line2D([], [], color="0.3", linewidth=WIDTHS[min(n, len(WIDTHS) - 1)],
+               label=f"leaps from {leap:g} on" if leap else "no leaps")
+        for n, leap in enumerate(_leaps(frontiers))
     ]  # fmt: skip
     return keys

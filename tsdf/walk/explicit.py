@@ -2,8 +2,8 @@
 
 A medium is filled by a periodic tile of spheres (`packing`), in which a grain stands where there is room (`room`).
 Which exemplar it is and how it is turned are functions of its place. Light enters a bounding sphere, is brought into
-the grain's frame, and goes one way at each hit, as in nature. The exact sphere is followed here without a ray engine;
-all other grains share one ray-engine scene for each exemplar.
+the grain's frame, and goes one way at each hit, as in nature. The exact sphere and convex grains of few sides, cubes
+and prisms, are followed here without a ray engine; all other grains share one ray-engine scene for each exemplar.
 """
 
 import math
@@ -25,12 +25,14 @@ from tsdf.scene.scene import GrainSpec, Scene, called
 from tsdf.spheres.around import Around, around_of
 from tsdf.spheres.packing import Cells, cells_of, next_sphere, pack
 from tsdf.vectors import KERNEL, dot, renewed, step, triple
-from tsdf.walk.geometry import planes_of
+from tsdf.walk.geometry import NONE, planes_of
 from tsdf.walk.room import stands
 from tsdf.walk.walker import write
 
 EXACT_SPHERE = -1
 ENTERED, INSIDE, RETRIED, LEFT = 0, 1, 2, 4
+MOST_SIDES = 64  # of a convex grain that needs no ray engine, which with more is faster
+FLAT = 1e-9  # [R] planes that near to each other are one side, and no vertex of a convex grain is higher over one
 
 
 class Grains(NamedTuple):
@@ -39,7 +41,8 @@ class Grains(NamedTuple):
     cells, centres, around: the tile's grid, its (n, 3) centres [R], and for grains that are not traced the spheres
     around each; radius (m,): R [unit]; seed (m,) uint64. Of components:
     share (c,): running sum of number fractions in each medium; eta, kept_apart (c,) (the polarisations), exemplar (c,)
-    int32: ray-engine scene. Of the exemplars' facets: planes (f, 4), centroids (f, 3), first_facet (e,).
+    int32: ray-engine scene. Of the exemplars' facets: planes (f, 4), centroids (f, 3), first_facet (e,). first_side
+    (e + 1,), sides (s,): of exemplars that are convex and have few sides, a facet of each side.
     """
 
     cells: tuple[Cells, ...]
@@ -54,6 +57,8 @@ class Grains(NamedTuple):
     planes: np.ndarray
     centroids: np.ndarray
     first_facet: np.ndarray
+    first_side: np.ndarray
+    sides: np.ndarray
 
 
 # ------------------------------------------------------------------------------------------- for kernels
@@ -149,6 +154,28 @@ def through_sphere(p, d, eta, kept_apart, key):
 
 
 @njit(**KERNEL)
+def side_met(grains, e, w):
+    """Return the facet of convex exemplar e that a walker in its frame meets next, -1 for none."""
+    p, d, planes = triple(w.e), triple(w.d), grains.planes
+    near, far, entry, way_out = 0.0, math.inf, NONE, NONE
+    for at in range(grains.first_side[e], grains.first_side[e + 1]):
+        facet = grains.sides[at]
+        n = (planes[facet, 0], planes[facet, 1], planes[facet, 2])
+        cosine, under = dot(n, d), planes[facet, 3] - dot(n, p)
+        if cosine > 0.0:
+            if under < far * cosine:
+                far, way_out = under / cosine, facet
+        elif cosine < 0.0:
+            if under < near * cosine:
+                near, entry = under / cosine, facet
+        elif under < 0.0:
+            far = -math.inf
+    if w.state & INSIDE:
+        return way_out
+    return entry if near < far else NONE
+
+
+@njit(**KERNEL)
 def at_facet(grains, w, facet):
     """Take a walker in a grain's frame to the facet that the ray engine found, -1 for none, and on: its facet, its key
     and where its next ray starts, off the facet along its normal.
@@ -236,8 +263,25 @@ def nothing_packed(media: int, components: int) -> Packed:
         planes=np.zeros((0, 4)),
         centroids=np.zeros((0, 3)),
         first_facet=np.zeros(0, np.int64),
+        first_side=np.zeros(1, np.int64),
+        sides=np.zeros(0, np.int64),
     )
     return Packed(arrays, [], ())
+
+
+def sides_of(grain: Grain, planes: np.ndarray) -> list[int]:
+    """Return a facet of each side of a convex grain; none of one that has dents or many sides.
+
+    planes : (f, 4) float64
+        Normal and height over the origin of its facets.
+    """
+    found: list[int] = []
+    for facet, plane in enumerate(planes):
+        if all(np.abs(planes[other] - plane).max() > FLAT for other in found):
+            if len(found) == MOST_SIDES or (grain.vertices @ plane[:3]).max() > plane[3] + FLAT:
+                return []
+            found.append(facet)
+    return found
 
 
 def built_in(table: Table) -> bool:
@@ -311,7 +355,7 @@ def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed
     share, eta, kept_apart, chosen = [], [], [], []
     engines: list[Any] = []
     known: dict[str, int] = {}
-    planes, centroids, first_facet = [np.zeros((0, 4))], [np.zeros((0, 3))], []
+    planes, centroids, first_facet, sides = [np.zeros((0, 4))], [np.zeros((0, 3))], [], [np.zeros(0, np.int64)]
     facets, at = 0, 0
     for medium, where in zip(scene.media, titles, strict=True):
         try:
@@ -337,6 +381,7 @@ def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed
                 planes.append(planes_of(corners))
                 centroids.append(corners.mean(axis=1))
                 first_facet.append(facets)
+                sides.append(facets + np.array(sides_of(grain, planes[-1]), np.int64))
                 facets += len(corners)
                 engines.append(embree_scene(grain))
             chosen.append(known[grain.mesh_hash])
@@ -354,5 +399,7 @@ def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed
         planes=np.concatenate(planes),
         centroids=np.concatenate(centroids),
         first_facet=np.array(first_facet, np.int64),
+        first_side=np.cumsum([len(own) for own in sides]),
+        sides=np.concatenate(sides),
     )
     return Packed(arrays, engines, tuple(notes))

@@ -377,7 +377,7 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
             else:
                 p = step(p, scale, offset)
                 bound -= size
-        if luck < DIM:
+        if luck < DIM and w.mode != JUMP:  # a jump that ends on a boundary gives some of its length back
             w.luck = luck
             key += GOLDEN
             if not lives(w, key):
@@ -558,7 +558,9 @@ def land(world, batch, w, amounts):
         if w.shadow:
             return ENDED
         if slot >= 0:
-            amounts[slot] -= w.gained * max(0.0, 1.0 - t / w.length)
+            back = w.gained * max(0.0, 1.0 - t / w.length)
+            amounts[slot] -= back
+            w.luck -= world.absorption.least[slot] * back
         return bounce(world, batch, w, amounts, e, (t, surface, n, slack))
     move = min(beyond(slack_b, dot(n_b, e)), 0.5 * (t - t_b)) if inside else 0.0
     if leaves:
@@ -575,7 +577,9 @@ def land(world, batch, w, amounts):
     w.mode, w.free = FLY, -1.0
     if leaves:
         if slot >= 0:
-            amounts[slot] -= w.gained * (1.0 - t_b / w.length)
+            back = w.gained * (1.0 - t_b / w.length)
+            amounts[slot] -= back
+            w.luck -= world.absorption.least[slot] * back
         outward = dot(triple(w.q), n_b)
         if outward < 0.0:
             move = -min(move, 0.5 * t_b)
@@ -744,16 +748,20 @@ def meet_grain(world, batch, w, amounts):
             return WAIT
         w.mode = FLY
         return ENDED
-    e = world.grains.exemplar[w.component]
-    if e == X.EXACT_SPHERE:
-        return in_grain(world, batch, w, amounts, NONE)
-    if w.ray >= 0:
-        return in_grain(world, batch, w, amounts, batch.grain_hits[e, w.ray])
-    w.ray = batch.asked[GRAINS_ASKED + e]
-    for k in range(3):
-        batch.grain_starts[e, w.ray, k], batch.grain_ways[e, w.ray, k] = w.e[k], w.d[k]
-    batch.asked[GRAINS_ASKED + e] += 1
-    return WAIT
+    grains, facet = world.grains, NONE
+    e = grains.exemplar[w.component]
+    if e != X.EXACT_SPHERE:
+        if grains.first_side[e] < grains.first_side[e + 1]:
+            facet = X.side_met(grains, e, w)
+        elif w.ray >= 0:
+            facet = batch.grain_hits[e, w.ray]
+        else:
+            w.ray = batch.asked[GRAINS_ASKED + e]
+            for k in range(3):
+                batch.grain_starts[e, w.ray, k], batch.grain_ways[e, w.ray, k] = w.e[k], w.d[k]
+            batch.asked[GRAINS_ASKED + e] += 1
+            return WAIT
+    return in_grain(world, batch, w, amounts, facet)
 
 
 @njit(**KERNEL)
