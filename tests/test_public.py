@@ -36,6 +36,7 @@ def test_build_refuses() -> None:
             tsdf.build("sphere", eta, effort)
 
 
+@pytest.mark.slow
 def test_render_takes_scenes_of_all_kinds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file, a dict and a scene give one picture; what is said of the scene holds unless it is said otherwise."""
     shutil.copy(CHECKS / "cube.tsdf.exr", tmp_path)

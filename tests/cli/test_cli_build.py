@@ -72,6 +72,7 @@ def test_the_recorded_command_makes_the_same_bytes(tmp_path: Path) -> None:
     assert first.read_bytes() == second.read_bytes()
 
 
+@pytest.mark.slow
 def test_material_is_recorded(tmp_path: Path) -> None:
     out = tmp_path / "s.exr"
     assert run("sphere", "--material", "ice", "--wavelength-nm", "600", "--out", out).exit_code == 0

@@ -106,6 +106,7 @@ def test_options(folder: Path) -> None:
     assert image.read_exr(folder / "O.EXR").rgb.shape == (4, 6, 3) and (folder / "O.png").is_file()
 
 
+@pytest.mark.slow
 def test_explicit_grains(folder: Path) -> None:
     """Asked for by the command or the scene, and what was made says so; 0 is a picture without."""
     assert run(folder, "--explicit-grains", 2, out="k.exr").exit_code == 0

@@ -102,6 +102,7 @@ def test_valid_files_are_read(program: Path, path: Path) -> None:
     assert run(program, "pixels", path, dtype=np.float32).tobytes() == pixels.tobytes()
 
 
+@pytest.mark.slow
 def test_invalid_files_are_refused_by_their_code(program: Path) -> None:
     """The first broken rule is the one that each file was made to break."""
     assert len(INVALID) > 80

@@ -609,6 +609,7 @@ bpy.ops.render.render(write_still=True)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "lobes, sky, bounces, sampling, agrees",
     [

@@ -234,6 +234,7 @@ def test_tpt_is_our_renderer_under_a_sun(body, absorption, llvm, ball, concave):
         assert consistent == (fraction == 0.5), (fraction, np.abs(z).max(), z.sum() / math.sqrt(z.size))
 
 
+@pytest.mark.slow
 def test_tpt_in_scalar_rgb(ball):
     """The scalar variant takes the same paths as the vectorised one: here by the mean of a tiny picture."""
     if not works("scalar_rgb"):
@@ -379,6 +380,7 @@ def test_stock_volpath_is_our_volume_level(absorption, llvm, ball):
         assert consistent == (interior is stock), (np.abs(z).max(), z.sum() / math.sqrt(z.size))
 
 
+@pytest.mark.slow
 def test_granular_in_stock_volpath(llvm, ball):
     """Where the integrator knows no grains, ``granular`` is the medium of point scatterers: the same scene renders."""
     interior = L.granular(ball, 0.5, 1.0)

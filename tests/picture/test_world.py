@@ -100,6 +100,7 @@ def test_grains_too_small_for_their_medium_are_refused(ball):
     assert not world.build(heap(ball, 0.01), "teleport").notes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [CUBE, Sphere((0.0, 0.0, 0.0), 3.0), Slab(-1.0, 2.0), "mesh"])
 def test_the_mean_chord_is_that_of_cauchy(shape, ball, tmp_path):
     """4 V/S by hand, of a mesh that is scaled, turned and moved too."""

@@ -238,6 +238,7 @@ def test_auto_in_python(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> No
     assert shot.chosen(replace(scene, render=Render("volume", 5)), target_error=0.1)[1:4] == (None, None, 0.1)
 
 
+@pytest.mark.slow
 def test_without_a_stop_it_is_done_at_the_target(far: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     """Noise is what the target leaves beside bias and texture."""
     monkeypatch.setattr(shot, "plan", lambda *_: far)

@@ -159,6 +159,7 @@ def order(centres: np.ndarray, side: float) -> tuple[float, float, float]:
     return q6, float((friends >= 7).mean()), stretch
 
 
+@pytest.mark.slow
 def test_dense_packing_is_no_crystal(packings: dict[float, Packing]) -> None:
     """At 0.6 no bond order in the large, hardly a solid-like sphere, no neighbours at 2 sqrt 2 R, no preferred axis.
 
@@ -333,6 +334,7 @@ def test_rays_that_meet_nothing_end() -> None:
         next_sphere(cells, (0.0, 0.0, 0.0), (0.6, 0.0, 0.8), 0.0, bad)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fraction", [0.1, 0.3, 0.6])
 def test_mean_gap_between_spheres(packings: dict[float, Packing], fraction: float) -> None:
     """The mean chord of the void is 4 (1 - f) / (3 f), an exact theorem of any packing, within 4 standard errors.

@@ -119,6 +119,7 @@ def test_all_candidates_are_measured(found: Frontier) -> None:
             assert mean_of(row.curve[0][1]).value > mean_of(row.curve[-1][1]).value
 
 
+@pytest.mark.slow
 def test_what_is_known_of_levels_is_found(found: Frontier) -> None:
     """The truth's own level, measured as all others, differs by nothing: the control. Every chain without explicit
     grains has the texture of single grains missing; the chain that forgets where light left the last grain, and fills

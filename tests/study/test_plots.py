@@ -57,6 +57,7 @@ def test_atoms_are_marked(tables):
     assert len(axes_of(figure, r"p(z\,").collections) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["cube", "cube_identity", "sphere"])
 def test_the_legend_covers_nothing(tables, name):
     """It stands clear of the axes and of the labels of atoms, and has a line for each curve."""

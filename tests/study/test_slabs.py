@@ -143,6 +143,7 @@ def test_ground(family: Family, found: Spectrum) -> None:
     assert Request("volume", FRACTION, math.inf, 0.6, ground=0.5).lights == (0.6,)
 
 
+@pytest.mark.slow
 def test_the_same_for_any_number_of_threads(family: Family, found: Spectrum) -> None:
     request = Request("teleport", FRACTION, 5.0)
     one, two = (slabs.measure(family, found, request, threads=k, paths=9000) for k in (1, 2))

@@ -113,6 +113,7 @@ def test_with_many_it_is_the_explicit_level(heap: Scene, inside: str) -> None:
         assert not np.array_equal(picture(asking(heap, 2, inside), level).rgb, truth.rgb)
 
 
+@pytest.mark.slow
 def test_with_none_nothing_is_packed(heap: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """and the chain has one place and one handle, as if there were no other way."""
     monkeypatch.setattr(explicit, "pack", lambda *_: pytest.fail("a packing is made"))

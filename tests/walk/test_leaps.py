@@ -138,6 +138,7 @@ def sun(angle: float) -> SunLight:
     return SunLight((0.3, 0.2, 1.0), (3.0, 3.0, 3.0), angle)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["teleport-memory", "teleport", "isotropic"])
 @pytest.mark.parametrize("angle", [0.53, 25.0])
 def test_light_that_is_aimed_is_not_lost(level: str, angle: float, ball: Table) -> None:
