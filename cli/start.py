@@ -17,7 +17,6 @@ from importlib import import_module
 from typing import IO
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-SWITCH_S = 1e-3  # [s] the most that a thread has Python to itself while others, between two kernels, wait for it
 AGAIN_S = 2.0  # [s] `timeout` sends each signal twice; one that comes later than this is meant
 SAVING_S = 1.0  # [s] for a file that is being written
 # Address space that libraries take whatever is computed, from trials: half of it for commands that only read tables.
@@ -52,7 +51,6 @@ def answer(name: str) -> None:
     if _name or threading.current_thread() is not threading.main_thread():
         return
     _name = name
-    sys.setswitchinterval(SWITCH_S)
     _open_streams()
     _error = os.dup(2)
     _check_memory()
