@@ -9,6 +9,7 @@ help:  ## list the targets
 .venv/installed: pyproject.toml
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(BIN)/python -m compileall -q tsdf cli loaders schema reference_data  # as pip does with what it copies
 	@touch $@
 
 install: .venv/installed  ## make the virtual environment .venv with everything in it

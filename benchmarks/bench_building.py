@@ -6,6 +6,11 @@ grains by as many paths as all runs have, four times over. What the build itself
 Writes building.json, .csv, .pdf, .svg and .png; building.json in the place of the grain draws them again.
 
     python benchmarks/bench_building.py sphere --out frontier
+
+With --threads it measures instead how much sooner more threads are done, and prints it: a build of so many paths, and
+one to the target error that they reach, in turn.
+
+    python benchmarks/bench_building.py snow --threads 1,2,4,8,16 --paths 1e7
 """
 
 import argparse
@@ -13,7 +18,9 @@ import csv
 import json
 import math
 import os
+import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -150,11 +157,52 @@ def chart(found: dict[str, Any], lines: list[dict[str, Any]]) -> Any:
     return figure
 
 
+def scaling(name: str, threads: list[int], paths: int, rounds: int = 3) -> Iterator[str]:
+    """Yield a line for each number of threads: seconds, and how near they come to being so many times as fast.
+
+    Seconds are the least of some rounds, in turn, from the begin of tracing to its end: grain and kernels are ready.
+    With a target the paths that it takes are counted, which are the same for any number of threads.
+    """
+    grain, folder = load_grain(name), tempfile.TemporaryDirectory()
+
+    def seconds(effort: Effort, count: int) -> tuple[float, int]:
+        build = Build.start(grain, Optics(ETA), effort)
+        begun = time.perf_counter()
+        build.run(grain, count, part_file=Path(folder.name) / "x.part", report=lambda _: None)
+        return time.perf_counter() - begun, build.paths
+
+    with folder:
+        first = Build.start(grain, Optics(ETA), Effort(paths=paths))
+        first.run(grain, max(threads))  # compiles
+        error = first.error()
+        assert error is not None
+        efforts = Effort(paths=paths), Effort(target_error=error.total_variation)
+        least = {(count, k): (math.inf, 0) for count in threads for k in range(2)}
+        for _ in range(rounds):
+            for count, k in least:
+                least[count, k] = min(least[count, k], seconds(efforts[k], count))
+    target, needed = error.total_variation, least[threads[0], 1][1]
+    yield f"{name}, {paths:.3g} paths, or --target-error {target:.3g}, which takes {needed:.3g}"
+    yield "threads, seconds, of perfect; to the target: seconds, of perfect"
+    for count in threads:
+        took = [least[count, k][0] for k in range(2)]
+        share = [threads[0] * least[threads[0], k][0] / (count * took[k]) for k in range(2)]
+        yield f"{count:7d} {took[0]:8.2f} {share[0]:11.2f} {took[1]:23.2f} {share[1]:11.2f}"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("grain", help="built in, a mesh file, or building.json of another time")
-    parser.add_argument("--out", type=Path, required=True, help="folder to write to")
+    parser.add_argument("--out", type=Path, help="folder to write to")
+    parser.add_argument("--threads", metavar="N,M,..", help="measure builds by so many threads instead")
+    parser.add_argument("--paths", type=float, default=1e7, help="of these builds")
     given = parser.parse_args()
+    if given.threads:
+        for line in scaling(given.grain, [int(count) for count in given.threads.split(",")], int(given.paths)):
+            print(line, flush=True)
+        return
+    if given.out is None:
+        parser.error("name a folder to write to: --out")
     given.out.mkdir(parents=True, exist_ok=True)
     if given.grain.endswith(".json"):
         found = json.loads(Path(given.grain).read_text())

@@ -12,6 +12,7 @@ import click
 from tsdf.cli.common import (
     Progress,
     Tool,
+    beside,
     check_numbers,
     check_output,
     plain,
@@ -240,8 +241,14 @@ def main(  # noqa: PLR0913 - an argument for each option
         if contradiction:
             raise UsageError(text)
 
+    from tsdf.grain.grains import load_grain
+
+    loaded = beside(lambda: load_grain(grain, repair="any" if repair_any else repair, **settings))
+
     from tsdf.make import scatterometer, tracer
 
+    if not exact:
+        tracer.ahead(load_grain("sphere"))  # machine code, while the grain is read
     optics = optics_of(eta, material, wavelength_nm, fresnel, quiet)
     if quality is not None:
         chosen = QUALITIES[quality]
@@ -258,11 +265,7 @@ def main(  # noqa: PLR0913 - an argument for each option
             raise TSDFError(f"{part_file} exists already: add --resume to go on with it, or choose another --out")
         raise TSDFError(f"{part_file} holds an unfinished build: add --resume to go on with it, or delete it")
 
-    from tsdf.grain.grains import load_grain
-
-    if not exact:
-        tracer.ahead(load_grain("sphere"))  # machine code, while the grain is read
-    shape = load_grain(grain, repair="any" if repair_any else repair, **settings)
+    shape = loaded()
     for text in shape.notes:
         note(text, quiet)
     if exact:
@@ -353,9 +356,12 @@ def trace(
     TSDFError
     """
 
+    from tsdf.data.format import get_ready
+
     def meaning() -> str | None:
         return None if build.done else "nothing is done yet"
 
+    beside(get_ready)
     try:
         with interruptible(meaning, raises=True):
             with shown_progress(quiet) as progress:

@@ -25,6 +25,7 @@ from tsdf.scene import levels
 LEVELS = tuple(levels.LEVELS)
 AUTO = levels.AUTO
 F = TypeVar("F", bound=Callable[..., Any])
+T = TypeVar("T")
 MOST_THREADS = 1024
 EVERY_S = 60.0  # [s] between lines of progress where no terminal shows a bar
 LEAST_S = 0.1  # [s] between two looks of a bar
@@ -113,6 +114,8 @@ class Tool(click.Command):
         except Exception as error:
             if os.environ.get("TSDF_DEBUG"):
                 raise
+            if "start new thread" in str(error):  # there is no room for its stack
+                return self._tell("error", "not enough memory", 1)
             hint = "this is a bug, please report it with the traceback that TSDF_DEBUG=1 shows"
             return self._tell("error", f"{type(error).__name__}: {error}; {hint}", 1)
 
@@ -120,6 +123,29 @@ class Tool(click.Command):
         with contextlib.suppress(OSError):
             click.echo(f"{self.name}: {kind}: {plain(message)}", err=True)
         return status
+
+
+def beside(work: Callable[[], T]) -> Callable[[], T]:
+    """Begin some work in a thread beside what goes on here; return what waits for it, and returns or raises what it
+    did."""
+    done: list[T | BaseException] = []
+
+    def run() -> None:
+        try:
+            done.append(work())
+        except BaseException as error:
+            done.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+
+    def result() -> T:
+        thread.join()
+        if isinstance(done[0], BaseException):
+            raise done[0]
+        return done[0]
+
+    return result
 
 
 # --- outputs ------------------------------------------------------------------------

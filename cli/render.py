@@ -120,12 +120,12 @@ def main(
             work.begun = True  # samples that a picture can be made of
             work.told(share, word)
 
-        work.told(0.0, "reading the scene")
-        choice = shot.chosen(read, level, spp, seconds, target_error, seed, threads, work.told)
-        made = world.build(choice.scene, choice.scene.render.level, leap=leap, progress=work.told)
+        work.progress(0.0, "reading the scene")
+        choice = shot.chosen(read, level, spp, seconds, target_error, seed, threads, work.progress)
+        made = world.build(choice.scene, choice.scene.render.level, leap=leap, progress=work.progress)
         for note in (*(report.notes(choice.plan) if choice.plan else ()), *made.notes):
             work.progress.note(note)
-        work.told(0.0, "starting")
+        work.progress(0.0, "starting")
         picture = render.render(made, choice.spp, choice.seconds, choice.target_error, seed, threads, told, work.stop)
         if not picture.samples.any():
             click.echo("interrupted before the first sample: nothing is written", err=True)

@@ -50,8 +50,8 @@ def main(
 
     Rows about tables judge TABLE, a file or a ready table, else all ready ones; others need none. docs/stress.md says
     how to read what comes out. Ctrl-C keeps the rows that are done. Exit status 1 if a method of ours fails where it is
-    claimed to hold, 130 if interrupted, 2 if the request cannot be meant. Of own-slab nothing is claimed: what levels
-    are worth depends on the grain.
+    claimed to hold, or a row that --rows names cannot be measured; 130 if interrupted, 2 if the request cannot be
+    meant. Of own-slab nothing is claimed: what levels are worth depends on the grain.
     """
     from tsdf.errors import UsageError
 
@@ -68,10 +68,13 @@ def main(
 
     setting = Setting(quick, seed, threads)
     if table is not None:
-        from tsdf.walk.explicit import mesh_beside
+        from tsdf.scene.specs import GrainSpec
+        from tsdf.walk.explicit import exemplar, mesh_beside
 
         setting.table = tsdf_format.read(table)
         setting.mesh = mesh or mesh_beside(setting.table, [table.parent])
+        if mesh is not None:
+            exemplar(GrainSpec(setting.table, mesh=mesh), setting.table, "--mesh")  # or else said after all other rows
     some = chosen(rows, setting)
     if out is not None:
         check_folder(out, FILES, *(path for path in (table, setting.mesh) if path is not None))
@@ -96,4 +99,4 @@ def main(
         say(report.terminal(found, shutil.get_terminal_size((report.COLUMNS, 24)).columns))
     if found.interrupted:
         return interrupt_status()
-    return 1 if found.broken else 0
+    return 1 if found.broken or (rows is not None and found.notes) else 0

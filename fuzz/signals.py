@@ -33,8 +33,11 @@ COMMANDS = {
     "info": "cube.tsdf.exr",
     "merge": "part --out new.exr",
     "packing": "--out new.exr --spheres 20000",
+    "plan": "scene.toml --seconds 1000",
     "plot": "cube.tsdf.exr --out new.png",
     "render": "scene.toml --out new.exr --spp 1000000",
+    "render auto": "scene.toml --level auto --out new.exr --seconds 1000",
+    "stress": "--quick --out folder",
     "validate": "cube.tsdf.exr cube.tsdf.exr cube.tsdf.exr",
 }
 
@@ -76,7 +79,8 @@ def trial(command: str, at: float, number: int, cold: bool, kept: Path) -> Trial
             shutil.copy(kept / "part", folder)
         own = folder / "cache" if cold else kept / "cache"
         environment = os.environ | {"NUMBA_CACHE_DIR": str(own), "TSDF_CACHE": str(folder / "packings")}
-        code = f"from tsdf.cli.start import {command}; {command}()"
+        entry = command.split()[0]
+        code = f"from tsdf.cli.start import {entry}; {entry}()"
         process = subprocess.Popen(
             [sys.executable, "-c", code, *COMMANDS[command].split()],
             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=folder, env=environment,

@@ -37,6 +37,7 @@ def run(package: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=own, check=True)
 
 
+@pytest.mark.slow
 def test_a_changed_callee_is_noticed(package: Path) -> None:
     """An upgrade that changes a kernel's callee alone runs the new one; numba's own cache runs the old one."""
     assert run(package).stdout.split()[:2] == ["2.0", "0"]
@@ -53,6 +54,7 @@ def test_a_changed_callee_is_noticed(package: Path) -> None:
     assert run(package).stdout.split()[:2] == ["3.0", "1"]
 
 
+@pytest.mark.slow
 def test_nowhere_to_keep_it(package: Path, tmp_path: Path) -> None:
     """Neither beside the package (a file is in the way) nor in a home: a private folder, or none; one line each."""
     (package / "__pycache__").write_text("in the way")
@@ -159,6 +161,7 @@ def test_what_is_fetched_is_what_it_was() -> None:
         assert summed(rows) == 18.0 and (rows == np.arange(12.0).reshape(4, 3)).all()
 
 
+@pytest.mark.slow
 def test_a_first_kernel_needs_no_scipy() -> None:
     """numba imports scipy's linear algebra before any kernel, for .15 s; kernels that multiply matrices still do."""
     code = (

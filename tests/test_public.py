@@ -16,6 +16,7 @@ TEXT = (Path(__file__).parent / "ball.toml").read_text()
 SCENE = {**tomllib.loads(TEXT), "render": {"spp": 2, "seed": 5, "level": "volume"}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [("sphere", "--cells", "32"), ("cube", "--paths", "5000", "--joint", "2")])
 def test_build_makes_what_the_command_makes(words: tuple[str, ...], tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as done:
@@ -35,6 +36,7 @@ def test_build_refuses() -> None:
             tsdf.build("sphere", eta, effort)
 
 
+@pytest.mark.slow
 def test_render_takes_scenes_of_all_kinds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file, a dict and a scene give one picture; what is said of the scene holds unless it is said otherwise."""
     shutil.copy(CHECKS / "cube.tsdf.exr", tmp_path)

@@ -15,7 +15,7 @@ import stat
 import tempfile
 import warnings
 from collections.abc import Callable
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -88,8 +88,7 @@ def njit(**options: Any) -> Callable[[Any], Any]:
         kernel.get_call_template = lambda args, kws: part().get_call_template([_any(kind) for kind in args], kws)
         kernel.get_overload = lambda signature: part().get_overload(signature)
         if kept:
-            with contextlib.suppress(RuntimeError):  # nowhere to keep it, which `_fallback` has said
-                kernel._cache = _Cache(function)
+            kernel._cache = _Kept(function)
         return kernel
 
     return compiled
@@ -157,6 +156,13 @@ def _text(name: str) -> bytes | None:
 
 
 @cache
+def _module_of(file: str) -> str | None:
+    """Return the name of the module of the package that is in this file, None if none is."""
+    path = Path(file)
+    return ".".join(path.relative_to(PACKAGE).with_suffix("").parts) if path.is_relative_to(PACKAGE) else None
+
+
+@cache
 def stamp(name: str) -> str:
     """Return the SHA-256 of the text of a module and of all it imports of the package, in hexadecimal.
 
@@ -220,10 +226,8 @@ class _Stamped:
     _py_file: str
 
     def get_source_stamp(self) -> Any:
-        path = Path(self._py_file)
-        if not path.is_relative_to(PACKAGE):
-            return super().get_source_stamp()  # type: ignore[misc]
-        return stamp(".".join(path.relative_to(PACKAGE).with_suffix("").parts))
+        name = _module_of(self._py_file)
+        return super().get_source_stamp() if name is None else stamp(name)  # type: ignore[misc]
 
 
 class _Given(_Stamped, caching.UserProvidedCacheLocator):
@@ -275,3 +279,25 @@ class _Cache(caching.FunctionCache):
             with contextlib.suppress(OSError), whole:
                 self.flush()
                 super().save_overload(signature, data)
+
+
+class _Kept:
+    """The cache of a kernel, made when the kernel is first called: of most, others call nothing but parts.
+
+    What the kernel is made of is read at once, before an upgrade of the package can change it.
+    """
+
+    def __init__(self, function: Any) -> None:
+        self._function = function
+        if (name := _module_of(function.__code__.co_filename)) is not None:
+            stamp(name)
+
+    @cached_property
+    def _made(self) -> Any:
+        try:
+            return _Cache(self._function)
+        except RuntimeError:  # nowhere to keep it, which `_fallback` has said
+            return caching.NullCache()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._made, name)

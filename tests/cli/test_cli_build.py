@@ -38,6 +38,7 @@ def one_line(result: Result) -> str:
     return result.stderr
 
 
+@pytest.mark.slow
 def test_sphere(tmp_path: Path) -> None:
     out = tmp_path / "s.tsdf.exr"
     result = run("sphere", "--eta", "1.33", "--out", out)
@@ -71,6 +72,7 @@ def test_the_recorded_command_makes_the_same_bytes(tmp_path: Path) -> None:
     assert first.read_bytes() == second.read_bytes()
 
 
+@pytest.mark.slow
 def test_material_is_recorded(tmp_path: Path) -> None:
     out = tmp_path / "s.exr"
     assert run("sphere", "--material", "ice", "--wavelength-nm", "600", "--out", out).exit_code == 0
@@ -79,6 +81,7 @@ def test_material_is_recorded(tmp_path: Path) -> None:
     assert optics["material"] == "ice" and "Warren" in optics["source"]
 
 
+@pytest.mark.slow
 def test_progress_and_summary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where no terminal shows a bar, a line now and then says how far it is: here at every look."""
     for name in ("EVERY_S", "LEAST_S"):
@@ -200,6 +203,7 @@ def test_grains_are_listed() -> None:
     assert "bevel=0 " in result.stdout and "gamma=35" in result.stdout
 
 
+@pytest.mark.slow
 def test_parts_and_merge(tmp_path: Path) -> None:
     parts = []
     for i in (1, 2):
@@ -263,7 +267,7 @@ def test_interrupt_says_what_is_safe(number: int, tmp_path: Path, launch: Callab
         (["cube", "--threads", "0"], 2, "threads"),
         (["cube", "--no-such-option"], 2, "--no-such-option"),
         (["sphere", "--paths", "5000"], 2, "--traced"),
-        (["sphere", "--target-error", "1e-6"], 2, "out of reach"),
+        pytest.param(["sphere", "--target-error", "1e-6"], 2, "out of reach", marks=pytest.mark.slow),
         (["no-such-grain"], 1, "built-in grains"),
     ],
 )
@@ -294,6 +298,7 @@ def test_full_disk_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert [p.name for p in tmp_path.iterdir()] == ["x.exr"] and out.read_bytes() == b"before"
 
 
+@pytest.mark.slow
 def test_unfinished_builds_are_not_lost(tmp_path: Path) -> None:
     out = tmp_path / "x.exr"
     assert run("cube", *FAST, "--chunk", "1/2", "--out", f"{out}.part").exit_code == 0
@@ -307,6 +312,7 @@ def test_unfinished_builds_are_not_lost(tmp_path: Path) -> None:
     assert not Path(f"{out}.part").exists()
 
 
+@pytest.mark.slow
 def test_meshes_from_files(tmp_path: Path) -> None:
     """The same octahedron as a file, at another size and place, is the same table to the rounding of the file."""
     from tsdf.grain.grains import load_grain
@@ -353,6 +359,7 @@ def test_inputs_are_not_overwritten(tmp_path: Path) -> None:
     assert mesh.read_text() == "v 0 0 0"
 
 
+@pytest.mark.slow
 def test_more_parts_than_chunks(tmp_path: Path) -> None:
     """A job array may be larger than the work: its idle jobs leave parts that merge like the others."""
     words = ["cube", "--eta", "1.31", "--paths", "8192", "--quiet"]
@@ -373,6 +380,7 @@ def test_refused_builds_leave_nothing_in_the_way(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_part_files_are_not_replaced(tmp_path: Path) -> None:
     """Whoever gives a part file as --out, to --resume perhaps, loses no paths, whatever the command."""
     from tsdf.cli.plot import main as plot

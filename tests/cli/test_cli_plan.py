@@ -29,6 +29,7 @@ def run(folder: Path, *words: object) -> Result:
     return CliRunner().invoke(main, [str(folder / "scene.toml"), *map(str, words)], prog_name="tsdf-plan")
 
 
+@pytest.mark.slow
 def test_what_it_says(folder: Path) -> None:
     """Three lines, what the table needs, a table of all candidates; the same as a file."""
     result = run(folder, "--target", 0.1, "--out", folder / "plan.json", "--seconds", 10)
@@ -50,6 +51,7 @@ def test_what_it_says(folder: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_json(folder: Path) -> None:
     result = run(folder, "--target", 0.1, "--json", "--quiet")
     assert result.exit_code == 0 and json.loads(result.stdout)["seconds"] is None and result.stderr == ""

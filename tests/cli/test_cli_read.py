@@ -259,6 +259,7 @@ def test_text_of_a_file_is_escaped(tmp_path):
 # --- validate -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_verdicts_and_exit_status():
     result = run(validate, SPHERE, CUBE)
     assert (result.exit_code, result.stderr) == (0, "")
@@ -288,6 +289,7 @@ def test_validate_json(tmp_path):
     assert reports[2]["findings"][0]["code"] == "FILE_UNREADABLE"
 
 
+@pytest.mark.slow
 def test_validate_plot(tmp_path):
     out = tmp_path / "a.png"
     assert run(validate, SPHERE, "--plot", out).exit_code == 0
@@ -301,6 +303,7 @@ def test_validate_plot(tmp_path):
 # --- plot, and what all share -------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_plot_writes_a_picture(tmp_path):
     result = run(plot, CUBE, "--out", tmp_path / "a.PNG")
     assert (result.exit_code, result.output) == (0, "")
@@ -314,6 +317,7 @@ def test_plot_refuses(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [(info,), (plot, "--out", "a.png")], ids=["info", "plot"])
 def test_bad_files(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -374,6 +378,7 @@ def installed(name, *arguments, **options):
     return subprocess.run([tool, *map(str, arguments)], capture_output=True, text=True, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tsdf-info", "tsdf-plot", "tsdf-validate"])
 def test_installed_commands(name, tmp_path):
     """Each answers --help, and a missing file without a traceback."""

@@ -17,7 +17,8 @@ from click.testing import CliRunner, Result
 
 from tsdf.cli import common
 from tsdf.cli.render import main
-from tsdf.picture import image
+from tsdf.errors import TSDFError
+from tsdf.picture import image, world
 from tsdf.reference_data.make_checks import CHECKS
 
 WIDTH, HEIGHT = 12, 8
@@ -105,6 +106,7 @@ def test_options(folder: Path) -> None:
     assert image.read_exr(folder / "O.EXR").rgb.shape == (4, 6, 3) and (folder / "O.png").is_file()
 
 
+@pytest.mark.slow
 def test_explicit_grains(folder: Path) -> None:
     """Asked for by the command or the scene, and what was made says so; 0 is a picture without."""
     assert run(folder, "--explicit-grains", 2, out="k.exr").exit_code == 0
@@ -245,6 +247,24 @@ def test_an_interrupt_before_anything_ends_at_once(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_getting_ready_leaves_nothing_to_keep(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However far the records for leaps are: an interrupt then ends at once, and not after a minute of compiling."""
+    works: list[common.Work] = []
+
+    class Known(common.Work):
+        def __init__(self, progress: common.Progress) -> None:
+            super().__init__(progress)
+            works.append(self)
+
+    def build(*_: object, progress: Callable[[float, str], None], **__: object) -> None:
+        progress(0.9, "records for leaps")
+        raise TSDFError(f"an interrupt means: {works[0].meaning()}")
+
+    monkeypatch.setattr(common, "Work", Known)
+    monkeypatch.setattr(world, "build", build)
+    assert run(folder).stderr.endswith("an interrupt means: nothing is written\n")
+
+
 def test_progress(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """A line a minute where there is no terminal; a kernel that is compiled is said to be."""
     clock = [0.0]
@@ -280,6 +300,7 @@ def test_a_reader_who_is_gone_costs_no_result(monkeypatch: pytest.MonkeyPatch) -
         progress.note("note")
 
 
+@pytest.mark.slow
 def test_level_auto(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A scene without a level is planned: what is taken, why, and what fixes it is said once, and is in the file; the
     command that is named makes the same picture. With a level nothing is planned."""

@@ -20,6 +20,7 @@ def run(command: object, *arguments: object) -> Result:
     return CliRunner().invoke(command.main, [str(a) for a in arguments])  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 def test_optics_says_the_same_everywhere(tmp_path: Path) -> None:
     """JSON, CSV and the table of numbers agree; phase functions, moments and picture are there."""
     files = {name: tmp_path / name for name in ("a.csv", "p.txt", "m.csv", "o.png")}
@@ -46,6 +47,7 @@ def test_optics_says_the_same_everywhere(tmp_path: Path) -> None:
     assert len([line for line in text if not line.startswith("#")]) == 4
 
 
+@pytest.mark.slow
 def test_albedo_says_what_was_asked(tmp_path: Path) -> None:
     plot, sheet = tmp_path / "a.png", tmp_path / "a.csv"
     result = run(
@@ -129,6 +131,7 @@ def test_near_wavelengths_keep_their_columns(tmp_path: Path) -> None:
     assert out.read_text().splitlines()[2] == "order,500.00001nm,500.00002nm"
 
 
+@pytest.mark.slow
 def test_tables_say_what_they_are_of(tmp_path: Path) -> None:
     """Without --material the constants are those of the table's own; of an index alone, of ice as before; of two
     materials, or of one that is not built in, they are asked for."""

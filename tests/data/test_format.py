@@ -56,6 +56,7 @@ def codes(data: bytes) -> list[str]:
 # --- golden files ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_golden_files_are_what_the_script_makes(tmp_path: Path) -> None:
     """Rationale: golden files that nobody can regenerate rot. Every byte, and no file more or less."""
     make_golden.main(tmp_path)
@@ -474,6 +475,7 @@ def test_random_headers_and_pixels() -> None:
     assert 50 < accepted < 300  # both outcomes are tried
 
 
+@pytest.mark.slow
 def test_random_containers() -> None:
     """As above for the EXR part: attributes and chunks changed at random, the digest right."""
     rng = np.random.default_rng(3)
@@ -534,6 +536,7 @@ def test_a_chunk_that_inflates_too_far() -> None:
         tracemalloc.stop()
 
 
+@pytest.mark.slow
 def test_a_long_hostile_header_takes_bounded_time() -> None:
     """A mebibyte of anything, in a file otherwise right, ends in a finding; no hang, no recursion."""
     header, pixels = make_golden.table(make_golden.WEIGHTS)

@@ -19,6 +19,7 @@ def cube() -> Table:
     return tsdf.read(CHECKS / "cube.tsdf.exr")
 
 
+@pytest.mark.slow
 def test_moments_are_those_of_the_header(cube: Table) -> None:
     """An integral without cells there, so alike to a cell's width; at order 400 the recurrence is still exact."""
     ball = exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=512))

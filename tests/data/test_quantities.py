@@ -81,6 +81,7 @@ def test_a_prism_in_others_words(prisms):
         assert abs(radius - 3.0 * shape["volume"] / shape["area"]) <= 4.0 * error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x", [0.0, 0.05, 1.0])
 @pytest.mark.parametrize("word", ["single_scattering_albedo", "asymmetry_factor", "asymmetry_factor_far_field"])
 def test_errors_are_those_of_unrelated_builds(prisms, word, x):

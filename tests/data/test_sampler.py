@@ -170,6 +170,7 @@ def test_every_axis_follows_the_table(kind, request):
     assert accepted(found), found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["p_theta", *AXES])
 def test_a_bias_of_two_percent_is_seen(name):
     """The negative control: masses of every other cell 2 % up, the rest down, in one block at a time; the others pass.
@@ -249,6 +250,7 @@ def test_no_cell_without_mass_is_drawn():
             assert has_mass(table.cos_theta_edges, p * (np.arange(len(p)) == column), samples.cos_theta[own]).all()
 
 
+@pytest.mark.slow
 def test_float32_numbers_are_taken_as_they_are(cube):
     """float32 random numbers, the largest below 1 among them, give what the same numbers in float64 give."""
     u = np.random.default_rng(10).random((1000, 6), dtype=np.float32)
@@ -257,6 +259,7 @@ def test_float32_numbers_are_taken_as_they_are(cube):
         np.testing.assert_array_equal(narrow, wide)
 
 
+@pytest.mark.slow
 def test_density(cube, sphere):
     """The density integrates to 1 minus the atoms, agrees with a histogram of samples, and has no atom in it."""
     for table in (cube, sphere):
@@ -298,6 +301,7 @@ def correlations(samples, columns):
     )
 
 
+@pytest.mark.slow
 def test_joint_records_keep_what_belongs_together(cube, sphere):
     """corr(r, z | theta) of joint samples is that of the traced records; factorised samples have none.
 
@@ -316,6 +320,7 @@ def test_joint_records_keep_what_belongs_together(cube, sphere):
     assert (np.abs(traced) > 5.0 * tolerance).sum() > 10
 
 
+@pytest.mark.slow
 def test_records_are_equally_likely_and_whole(cube, sphere):
     """Each record of a column is drawn as often, with all its fields, and the ends of u give the first and last."""
     for table in (cube, sphere):
@@ -334,6 +339,7 @@ def test_records_are_equally_likely_and_whole(cube, sphere):
         np.testing.assert_array_equal(Sampler(table, joint=True).sample(u).r, fields[[0, -1, -1], 0])
 
 
+@pytest.mark.slow
 def test_geometry():
     """d_out and the offset have the cosine, z, r and azimuth that were drawn, for any d_in.
 

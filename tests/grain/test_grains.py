@@ -123,6 +123,7 @@ def test_ellipsoid_volume():
     assert grain.volume * grain.bounding_radius**3 == pytest.approx(4 * np.pi / 3, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_sand_statistics():
     """The sand's radii have the relative standard deviation and correlation they claim.
 
@@ -207,6 +208,7 @@ def test_exact_sphere():
 # -------------------------------------------------------------------------------------------- files
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["obj", "ply", "stl", "off", "glb"])
 def test_formats(kind, tmp_path):
     """The same grain from every format, within the precision of the format."""
@@ -326,6 +328,7 @@ def test_scale_and_place_do_not_matter(scale, shift):
     assert (grain.area, grain.volume) == pytest.approx((expected.area, expected.volume), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_hash_ignores_order():
     vertices, faces = mesh("sand", subdivisions=2)
     rng = np.random.default_rng(3)
@@ -356,6 +359,7 @@ def brute_sphere(points):
     return best
 
 
+@pytest.mark.slow
 def test_bounding_sphere():
     """Against brute force on small random sets, and known radii of degenerate ones."""
     rng = np.random.default_rng(4)
@@ -427,6 +431,7 @@ def test_near_vertices_are_welded():
             np.arange(len(loose)).reshape(-1, 3))  # fmt: skip
 
 
+@pytest.mark.slow
 def test_bodies_and_cavities():
     """Two balls, one with a cavity that holds a third: three bodies, whichever are turned over."""
     ball = mesh("icosphere", subdivisions=2)
@@ -505,6 +510,7 @@ def box(at=(0, 0, 0), sides=(1, 1, 1)):
     return (vertices + 0.5) * sides + at, faces
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("at", "radius"), [((1, 1, 1), 3**0.5), ((1, 1, 0), 1.5), ((-1, 0, 1), 1.5)])
 def test_bodies_that_touch_in_a_corner_or_along_an_edge(at, radius):
     """Each closed: bodies of their own, with vertices of their own, however their faces are wound."""
@@ -518,6 +524,7 @@ def test_bodies_that_touch_in_a_corner_or_along_an_edge(at, radius):
         assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [(1, 0, 0), (1, 0.3, 0.2), (0, 1, 0.5), (0.25, 0.25, 1)])
 def test_bodies_that_touch_over_a_face(at):
     """Over a whole face, whatever its diagonal, or over part of one: refused, and it says so."""
@@ -543,6 +550,7 @@ def voxels(cells):
     return np.argwhere(np.ones(n, bool)).astype(float), np.vstack(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shape", "share"), [((2, 2, 2), 0.5), ((3, 3, 3), 0.4), ((5, 6, 7), 0.35), ((7, 6, 5), 0.75)])
 def test_clusters_of_voxels(shape, share):
     """Random volumes: V and A count cells and faces; bodies are cells joined over faces, found by other means."""
@@ -591,6 +599,7 @@ def test_overlapping_spheres(share):
     refused("crosses itself", *joined(ball, moved(ball, 1, (lens(share), 0, 0))))
 
 
+@pytest.mark.slow
 def test_spike_pushed_through():
     """One vertex of a sphere pushed through the opposite wall."""
     vertices, faces = mesh("icosphere", subdivisions=4)
@@ -636,6 +645,7 @@ def test_slender_crystals_are_convex_within_their_digits(given):
     assert grain_from_mesh((vertices @ spin).astype(np.float32), faces).convex
 
 
+@pytest.mark.slow
 def test_a_dent_is_no_rounding():
     """The same float32 sphere with one vertex a thousandth of R too deep, and the concave prism on a coarse grid."""
     vertices, faces = mesh("icosphere", subdivisions=4)
@@ -665,6 +675,7 @@ def test_far_from_the_origin_digits_run_out():
     assert "on a grid of 1.9 % of R" in grain.notes[0] and "nearer to the origin" in grain.notes[0]
 
 
+@pytest.mark.slow
 def test_grids_that_are_meant():
     """Whole numbers of a few corners, voxels, marching cubes on binary data (corners in the middle of edges)."""
     for name in ("cube", "octahedron", "tetrahedron"):

@@ -540,6 +540,7 @@ def test_3mf_of_several_models(tmp_path):
         assert size(grain) == pytest.approx((4, 20)) and grain.bodies == 2
 
 
+@pytest.mark.slow
 def test_dae_scenes(tmp_path):
     """A node that mirrors, concave polygons, a geometry that is not there."""
     mirror = loaded(tmp_path, "mirror.dae", fuzz.DAE.replace("<translate>1 0 0</translate>", "<scale>-1 1 1</scale>"))

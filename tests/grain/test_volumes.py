@@ -87,6 +87,7 @@ def test_all_kinds_of_files(kind, voxels, tmp_path):
     assert found.spacing == (None if kind in ("npy", "tif", "folder") else (2.0, 2.0, 3.0))
 
 
+@pytest.mark.slow
 def test_command(voxels, tmp_path, capsys):
     """Each grain is a closed mesh of its size and place; what is left out is said."""
     np.save(tmp_path / "v.npy", voxels)
@@ -111,6 +112,7 @@ def test_command(voxels, tmp_path, capsys):
     assert "is not empty" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_cavity_stays_one():
     shell = ball((20, 20, 20), 16, (41, 41, 41)) & ~ball((20, 20, 20), 9, (41, 41, 41))
     ((grain, count),) = volumes.solids(volumes.parts(shell), smoothing=1.0)

@@ -94,6 +94,7 @@ def test_masses_match_the_printed_rows(fresnel):
     assert deflection_masses(CELLS, 1.33, fresnel) == pytest.approx(printed, abs=PRINTED)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("eta, name", [(1.31, "131"), (1.33, "133"), (1.333, "1333")])
 def test_phase_function_matches_the_reference_program(eta, name):
     """P_sp and P_un to 1e-11 but for their common divisor; GOMsphere itself where its root search is fine."""
@@ -322,6 +323,7 @@ def test_masses_at_a_rainbow():
     assert within > 20 * outside
 
 
+@pytest.mark.slow
 def test_masses_are_legendre_moments():
     """The closed series of the moments against the cells: P_2 and P_3 from 20000 cells."""
     edges = np.linspace(-1, 1, 20001)
@@ -342,6 +344,7 @@ def test_path_length_of_isotropic_light(eta, fresnel):
     assert bound == pytest.approx(exact, abs=1e-12) if eta <= 1 else bound > exact
 
 
+@pytest.mark.slow
 def test_offset_halves_the_deviation():
     """r = |z| tan(theta/2) for every path: chord and deviation turn together (checked at folds and off)."""
     e = sphere_events(1.33, intervals=20000)

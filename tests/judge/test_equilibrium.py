@@ -11,6 +11,7 @@ from tsdf.make.tally import Tally
 from tsdf.make.tracer import Tracer
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sides", [4, 6])
 @pytest.mark.parametrize("eta", [0.8, 1.0, 1.2, 1.31, 1.4, 1.5, 1.544, 2.0, 3.0])
 def test_against_random_directions(sides, eta):
@@ -43,6 +44,7 @@ def test_only_known_grains_are_judged():
     assert reach({**cube, "name": "hexprism", "parameters": {"aspect": 3.0}}, 1.5) == reach_of_prism(1.5, 6)
 
 
+@pytest.mark.slow
 def test_the_tracer_agrees_where_prisms_are_not_all_reached():
     """A hexagonal prism at 1.5 holds 12 % of directions that no light reaches; were all reached, it would show."""
     grain, tally = load_grain("hexprism"), Tally()

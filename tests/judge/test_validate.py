@@ -61,6 +61,7 @@ def test_sound_tables_pass(name):
     assert report.parts == ("structure", "statistics", "physics")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAULTS)
 def test_each_fault_is_found(name):
     path = CHECKS / f"{name}.tsdf.exr"
@@ -84,6 +85,7 @@ def test_the_codes_are_a_closed_set():
     }
 
 
+@pytest.mark.slow
 def test_golden_files_are_what_their_script_makes():
     made = make_checks.checks()
     assert set(made) == set(FAULTS)
@@ -91,6 +93,7 @@ def test_golden_files_are_what_their_script_makes():
         assert (CHECKS / f"{name}.tsdf.exr").read_bytes() == data, name
 
 
+@pytest.mark.slow
 def test_no_number_of_a_sound_table_is_near_its_limit_by_accident():
     """Every scalar statistic of the exact sphere, 2 % off, is an error."""
     table = base("sphere")
@@ -159,6 +162,7 @@ def test_records_by_entry_of_exact_spheres_pass(eta, fresnel, memory):
     assert errors(exact_sphere(load_grain("sphere"), Optics(eta, fresnel), Effort(cells=62, memory=memory))) == set()
 
 
+@pytest.mark.slow
 def test_records_by_entry_of_another_grain_fail():
     """Those of another eta, of another solid, or of fewer hits, below an otherwise sound table."""
     first = next(b["first_row"] for b in traced(memory=32).header["blocks"] if b["name"] == "memory_hit")
@@ -176,6 +180,7 @@ def test_records_by_entry_of_another_grain_fail():
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [0.98, 1.02])
 def test_a_tracer_with_two_percent_too_much_or_little_reflectance_fails(scale):
     """2e5 paths know <z> to 2e-4 R, and 2 % of the reflectance moves it by 2.6e-3."""

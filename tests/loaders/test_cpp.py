@@ -90,6 +90,7 @@ def first_error(data: bytes) -> str:
 # ---------------------------------------------------------------------------------------------------- reading
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", VALID, ids=lambda p: p.name.partition(".")[0])
 def test_valid_files_are_read(program: Path, path: Path) -> None:
     """Header and pixels are those of the ``.json`` beside each file, bit for bit, and so are the warnings."""
@@ -101,6 +102,7 @@ def test_valid_files_are_read(program: Path, path: Path) -> None:
     assert run(program, "pixels", path, dtype=np.float32).tobytes() == pixels.tobytes()
 
 
+@pytest.mark.slow
 def test_invalid_files_are_refused_by_their_code(program: Path) -> None:
     """The first broken rule is the one that each file was made to break."""
     assert len(INVALID) > 80
@@ -249,6 +251,7 @@ def test_same_numbers_same_events_as_python(program: Path, key: tuple[str, bool]
     assert np.abs(off - rows[:, 6:]).max() > 1e-6
 
 
+@pytest.mark.slow
 def test_events_of_a_traced_table(program: Path) -> None:
     """100,000 events of a cube with atoms: every cell is as in Python, and d_out and the offset for any d_in."""
     rng = np.random.default_rng(6)
@@ -329,6 +332,7 @@ def test_records_that_are_missing(program: Path) -> None:
 # ----------------------------------------------------------------------------------------------------- shader
 
 
+@pytest.mark.slow
 def test_the_example_of_the_documentation(tmp_path: Path) -> None:
     """It compiles without a warning and reads a table."""
     include, _, body = (
@@ -346,6 +350,7 @@ def test_the_example_of_the_documentation(tmp_path: Path) -> None:
     assert len(lines[-1].split()) == 2 and float(lines[-1].split()[1]) > 0.0
 
 
+@pytest.mark.slow
 def test_the_shader_of_the_documentation(program: Path, tmp_path: Path) -> None:
     """The GLSL of docs/cpp.md, compiled as C++, draws what the sampler draws, as far as 32 bits go.
 

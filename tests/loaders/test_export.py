@@ -201,6 +201,7 @@ def test_every_target_has_the_numbers_of_the_medium(cube: Table, products: tuple
     assert (1.0 - share) * one + share * two == pytest.approx(mean_of_fit(cube), abs=1e-8)
 
 
+@pytest.mark.slow
 def test_units() -> None:
     """Grains of twice the radius scatter and absorb half as much per unit; the same ice in metres and in millimetres.
 
@@ -228,6 +229,7 @@ def test_two_lobes_only_where_needed(cube: Table) -> None:
     assert len(point_medium(Table(header, cube.pixels), 0.6, 1.0).lobes()) == 1
 
 
+@pytest.mark.slow
 def test_black_grains(ball: Table) -> None:
     """Grains that let nothing out still make a medium, one that only absorbs."""
     request = export.Request(point_medium(ball, 0.6, 1.0, Absorption("grey", (1e6,))))
@@ -286,6 +288,7 @@ def test_two_lobes_are_nearer_where_the_shape_counts(cube: Table) -> None:
     assert abs(of_two - truth) < 0.5 * abs(of_one - truth)
 
 
+@pytest.mark.slow
 def test_colour_of_a_material(ball: Table) -> None:
     """A deep layer of grains of ice 5 mm in radius has the colour it has by wavelength.
 
@@ -332,6 +335,7 @@ def orders(g: float, depth: float, walks: int) -> np.ndarray:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("absorption", [0.0, 0.002])
 def test_number_of_bounces(ball: Table, absorption: float) -> None:
     """Walks end as late as said: a slab of 80 R loses a tenth and a hundredth of its light within 4 sigma and a tenth.
@@ -349,6 +353,7 @@ def test_number_of_bounces(ball: Table, absorption: float) -> None:
         assert energy[walks > n // 2].sum() / energy.sum() > 1.0 - kept + tolerance
 
 
+@pytest.mark.slow
 def test_bounces_are_monotone(ball: Table) -> None:
     """Thicker bodies and more light need more; a deep lossless body loses a known share, as 1/sqrt(n)."""
     medium = point_medium(ball, 0.6, 1.0)
@@ -483,6 +488,7 @@ def test_npz_holds_the_records_by_entry(tmp_path: Path) -> None:
 GOOD = {"--to": "pbrt", "--packing": "0.6", "--radius": "1"}
 
 
+@pytest.mark.slow
 def test_sizes_densities_and_colours_in_any_word(cube: Table, tmp_path: Path) -> None:
     """The medium that radius, packing and absorption say, said otherwise; both sides stand in the text."""
     from tsdf.scene.deep import absorption_of_colour
@@ -603,6 +609,7 @@ bpy.ops.render.render(write_still=True)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "lobes, sky, bounces, sampling, agrees",
     [

@@ -180,6 +180,7 @@ def test_furnace_is_exactly_one(body, variant, crystal, concave):
     assert np.abs(picture[..., :3] - 1.0).max() <= 1e-5
 
 
+@pytest.mark.slow
 def test_absorbing_furnace_is_not_one(llvm, ball):
     """The control of the furnace: grains that take something are darker than 1."""
     scene = theirs(BOX, L.granular(ball, 0.5, 1.0, 0.05), [CONSTANT], {"type": "tpt"})
@@ -233,6 +234,7 @@ def test_tpt_is_our_renderer_under_a_sun(body, absorption, llvm, ball, concave):
         assert consistent == (fraction == 0.5), (fraction, np.abs(z).max(), z.sum() / math.sqrt(z.size))
 
 
+@pytest.mark.slow
 def test_tpt_in_scalar_rgb(ball):
     """The scalar variant takes the same paths as the vectorised one: here by the mean of a tiny picture."""
     if not works("scalar_rgb"):
@@ -286,6 +288,7 @@ def test_mixture_and_file_in_xml(llvm, ball, crystal, tmp_path):
         assert (np.abs(z).max() < sidak(z.size) and abs(z.sum()) / math.sqrt(z.size) < 4.0) == (fraction == "3;1")
 
 
+@pytest.mark.slow
 def test_sizes_densities_and_colours_in_any_word(llvm, ball, crystal):
     """What is said in others' words is the medium that `sizes` and `deep` say, in Python and by plugin parameters."""
     facts = convert([(crystal, 1.0)], {"radius": 0.5, "packing_fraction": 0.4}).facts()
@@ -377,6 +380,7 @@ def test_stock_volpath_is_our_volume_level(absorption, llvm, ball):
         assert consistent == (interior is stock), (np.abs(z).max(), z.sum() / math.sqrt(z.size))
 
 
+@pytest.mark.slow
 def test_granular_in_stock_volpath(llvm, ball):
     """Where the integrator knows no grains, ``granular`` is the medium of point scatterers: the same scene renders."""
     interior = L.granular(ball, 0.5, 1.0)
@@ -427,6 +431,7 @@ def test_unknown_variant():
     assert "llvm_ad_rgb" in line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("library", ["missing", "not-llvm", "too-old"])
 def test_no_working_llvm(library, tmp_path):
     """A library that is not there, is another or is too old ends in one line, not in the end of the process."""
@@ -482,11 +487,13 @@ def refused(shapes: dict, match: str) -> None:
     assert "\n" not in str(error)
 
 
+@pytest.mark.slow
 def test_open_boundary(llvm, ball):
     """A rectangle bounds nothing."""
     refused({"wall": {"type": "rectangle", "bsdf": {"type": "null"}, "interior": L.granular(ball, 0.5, 0.1)}}, "open")
 
 
+@pytest.mark.slow
 def test_overlapping_media(llvm, ball):
     move = mi.ScalarTransform4f().translate([1.0, 0.0, 0.0])
     body = {"type": "sphere", "bsdf": {"type": "null"}}
@@ -515,6 +522,7 @@ def test_coloured_media_load_in_every_unit(variant, unit, ball):
         assert np.array(scattering).ravel() == pytest.approx([c.sigma_s for c in channels], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_units_change_no_coloured_picture(variant, ball):
     """One ball of coloured grains in two units, 200 and 0.2 across, is one picture to float32; twice the absorption
     is another: the negative control."""

@@ -74,6 +74,7 @@ def parts(octahedron: Grain, tmp_path_factory: pytest.TempPathFactory) -> list[P
     return files
 
 
+@pytest.mark.slow
 def test_parts_merge_to_the_whole_in_any_order(reference: bytes, parts: list[Path], tmp_path: Path) -> None:
     for order in (parts, parts[::-1]):
         tsdf.write(merge(order).table(), tmp_path / "m.tsdf.exr")
@@ -84,6 +85,7 @@ def test_parts_merge_to_the_whole_in_any_order(reference: bytes, parts: list[Pat
         merge([*parts, parts[0]])
 
 
+@pytest.mark.slow
 def test_a_table_without_records_by_entry_is_as_ever(octahedron: Grain) -> None:
     """Version 1.0 and the same pixels; the records by entry stand below them, each in the cell of its column."""
     optics = Optics(1.31)
@@ -195,6 +197,7 @@ def test_paths_serve_every_request_they_can_answer(octahedron: Grain, reference:
             served(paths=30_000, **effort)
 
 
+@pytest.mark.slow
 def test_a_table_as_good_as_it_got(octahedron: Grain) -> None:
     """No time at all: the first paths, a table of them that says its error, and the same bytes as by number."""
     build = Build.start(octahedron, Optics(1.31), Effort(target_error=1e-4))
@@ -214,7 +217,8 @@ def test_kill_loses_no_more_than_a_few_seconds(
     """A process killed without warning leaves a part file from which the build goes on to the same bytes."""
     out = tmp_path / "k.tsdf.exr"
     part = Path(f"{out}.part")
-    command = [sys.executable, "-c", "from tsdf.cli.build import main; main()", "octahedron", "--eta", "1.31"]
+    code = "from tsdf.make import scatterometer as s; s.SAVE_S = 0.1; from tsdf.cli.build import main; main()"
+    command = [sys.executable, "-c", code, "octahedron", "--eta", "1.31"]
     command += ["--paths", "1000000", "--quiet", "--threads", "1", "--out", str(out)]
     process = launch(command)
     while not part.exists() and process.poll() is None:
@@ -260,6 +264,7 @@ def test_damaged_part_files_are_refused(octahedron: Grain, tmp_path: Path) -> No
         Build.load(tmp_path / "absent.part")
 
 
+@pytest.mark.slow
 def test_part_files_that_lie_are_refused(octahedron: Grain, tmp_path: Path) -> None:
     """Whole archives with a right digest, but of counts that no tracer can have made, or that would grow when read."""
     part = tmp_path / "x.part"
@@ -325,6 +330,7 @@ def test_chunks_cover_all_paths_once() -> None:
 # ------------------------------------------------------------------------------------------ effort and errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", [0.05, 0.01])
 def test_target_error_is_met_in_truth(target: float) -> None:
     """The traced sphere's total variation to the exact density is what was asked for, and not much less.
@@ -344,12 +350,14 @@ def test_target_error_is_met_in_truth(target: float) -> None:
     assert table.p_theta[0] == table.p_theta[-1] == 0.0
 
 
+@pytest.mark.slow
 def test_target_error_stops_at_the_same_path_for_any_threads(octahedron: Grain, tmp_path: Path) -> None:
     for threads in (1, 3):
         tsdf.write(built(octahedron, Optics(1.31), threads, target_error=0.05), tmp_path / f"{threads}.tsdf.exr")
     assert (tmp_path / "1.tsdf.exr").read_bytes() == (tmp_path / "3.tsdf.exr").read_bytes()
 
 
+@pytest.mark.slow
 def test_target_takes_no_more_paths_and_cells_than_needed(octahedron: Grain) -> None:
     """One chunk less, or one candidate of the cells less, does not meet the target."""
     target = 0.02
@@ -365,6 +373,7 @@ def test_target_takes_no_more_paths_and_cells_than_needed(octahedron: Grain) -> 
     assert statistics.TableErrors(shorter.tally).fewest(target) is None
 
 
+@pytest.mark.slow
 def test_a_target_costs_a_handful_of_judgements(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each of a few numbers of cells, on the way to where noise, falling as the root of the paths, lets it be met."""
     asked: list[int] = []
@@ -378,6 +387,7 @@ def test_a_target_costs_a_handful_of_judgements(monkeypatch: pytest.MonkeyPatch)
     assert build.paths > 200_000 and len(asked) < 120
 
 
+@pytest.mark.slow
 def test_unreachable_target_is_refused(octahedron: Grain) -> None:
     build = Build.start(octahedron, Optics(1.31), Effort(target_error=0.01, cells=8))
     with pytest.raises(UsageError, match="8 cells of theta alone cost"):
@@ -444,6 +454,7 @@ def test_a_grain_that_keeps_its_light_is_refused() -> None:
 # ------------------------------------------------------------------------------------------ physics
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fresnel", ["un", "sp"])
 def test_exact_table_is_the_exact_sphere(fresnel: str) -> None:
     table = scatterometer.exact_sphere(load_grain("sphere"), Optics(1.33, fresnel), Effort(joint=256))
@@ -557,6 +568,7 @@ def test_merging_cells_keeps_the_sums() -> None:
         assert np.all(np.diff(edges[1:-1]) > 0)
 
 
+@pytest.mark.slow
 def test_records_by_entry_keep_the_means_of_all_paths():
     """A chain of grains multiplies what its records get wrong, so the mean deflection and offset are those of the
     header, not of a sample of so many."""
@@ -575,6 +587,7 @@ def test_records_by_entry_keep_the_means_of_all_paths():
 # ------------------------------------------------------------------------------------------ nothing is lost
 
 
+@pytest.mark.slow
 def test_a_target_that_is_met_is_met_when_resumed(octahedron: Grain, tmp_path: Path) -> None:
     """A build that was stopped after its target was met, before its table was made, asks for no more paths."""
     part = tmp_path / "x.part"

@@ -110,6 +110,7 @@ def test_sobol_points_fill_the_boxes() -> None:
     assert np.array_equal(first[1, :3], [0.5, 0.75, 0.625])
 
 
+@pytest.mark.slow
 def test_keys_and_angles() -> None:
     keys = {key_of(seed, a, b) for seed in range(10) for a in range(10) for b in range(10)}
     assert len(keys) == 1000
@@ -133,6 +134,7 @@ def bumpy(seed: int) -> Grain:
     return grain_from_mesh(ball.vertices * height[:, None] * (1.0, 0.7, 0.25), ball.faces)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["snow", "sand", "bumpy 0", "bumpy 1"])
 def test_nothing_stands_above_the_horizon(which: str) -> None:
     """Of 4e5 rays that leave facets above their horizon not one meets the grain; below it many do."""
@@ -158,6 +160,7 @@ def test_nothing_stands_above_the_horizon(which: str) -> None:
     assert hit[~above].any()
 
 
+@pytest.mark.slow
 def test_one_ray_by_hand() -> None:
     """Records of the sphere obey Snell's law, in one plane, with the signs of SPEC.md.
 
@@ -236,6 +239,7 @@ def cube_hits(b2: np.ndarray, seed: int) -> np.ndarray:
     return hits
 
 
+@pytest.mark.slow
 def test_hits_by_entry_of_a_cube() -> None:
     """The share that meets a cube by distance from its centre, against slabs: 4 standard errors of both.
 
@@ -388,6 +392,7 @@ def test_both_estimators_agree(name: str) -> None:
     assert differences[np.maximum(errors, other_errors) > 1e-9].max() < 4.0
 
 
+@pytest.mark.slow
 def test_a_cavity_refracts_as_one() -> None:
     """A ball of glass with a hollow of its own radius but a hair is an empty shell: light goes nearly straight on."""
     ball = load_grain("icosphere", subdivisions=4)

@@ -25,6 +25,7 @@ def ball():
     return exact_sphere(load_grain("sphere"), Optics(1.31, material="ice"), Effort(cells=64))
 
 
+@pytest.mark.slow
 def test_the_renderer_agrees(ball):
     """Level volume, deep and a slab, within 4 standard errors; 15 % more absorption in one channel is found."""
     found = absorption_of_colour(ball, ASKED)
@@ -39,6 +40,7 @@ def test_the_renderer_agrees(ball):
     assert slab[0] < ASKED[0] - 0.1
 
 
+@pytest.mark.slow
 def test_info_renders_the_colour(ball, tmp_path):
     """tsdf-info says what a level makes of it, and the absorption of a colour as far off on the other side."""
     tsdf.write(ball, tmp_path / "ball.tsdf.exr")

@@ -16,6 +16,7 @@ from tsdf.errors import TSDFError, UsageError
 from tsdf.grain.materials import optical_constants
 from tsdf.picture import image
 from tsdf.picture.image import read_environment, read_exr, spectral_weights, write_exr, write_png
+from tsdf.reference_data import make_observer
 
 PRINTED = np.get_printoptions()
 with warnings.catch_warnings():
@@ -38,11 +39,14 @@ def written(path, channels, **header):
 # ------------------------------------------------------------------------------------------------ EXR
 
 
+@pytest.mark.slow
 def test_colour_science_changes_nothing_else() -> None:
-    """Its import sets numpy's way of printing, on which other people's output and our golden files depend."""
+    """Its import sets numpy's way of printing, on which other people's output and our golden files depend; and takes
+    longer than a small picture, which needs nothing of it."""
     code = (
-        "import numpy as np; before = np.get_printoptions(); from tsdf.picture import image; image.spectral_weights(); "
-        "assert np.get_printoptions() == before"
+        "import sys, numpy as np; before = np.get_printoptions(); from tsdf.picture import image; "
+        "image.spectral_weights(); assert 'colour' not in sys.modules; image._colour(); "
+        "assert 'colour' in sys.modules and np.get_printoptions() == before"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -385,6 +389,7 @@ def test_other_primaries_are_converted(tmp_path):
     assert "makes no sense" in read(0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3).notes[0]
 
 
+@pytest.mark.slow
 def test_small_files_of_many_pixels_are_refused_before_they_are_read(tmp_path):
     """A black image of 8192 x 4096 pixels is a small file that would take gigabytes as an environment."""
     path = written(tmp_path / "sky.exr", dict.fromkeys("RGB", np.zeros((4096, 8192), np.float16)))
@@ -478,6 +483,13 @@ def test_white_stays_white():
     assert spectral_weights() is spectrum
     with pytest.raises(ValueError, match="read-only"):
         spectrum.weight[0, 0] = 0.0
+
+
+def test_observer_is_that_of_colour_science():
+    """The file that stands for the library is what its script makes, the matrix is the library's, to the last bit."""
+    assert "\n".join(make_observer.lines()) + "\n" == make_observer.OBSERVER.read_text(encoding="ascii")
+    matrix = colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB
+    assert np.array_equal(matrix, image.XYZ_TO_RGB)
 
 
 @pytest.mark.parametrize("metres", [0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0])

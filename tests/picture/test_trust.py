@@ -126,6 +126,7 @@ def picture(table: Table, level: str, diameter: float, spp: int = 16, threads: i
     return render.render(world.build(scene_of(table, diameter), level), spp=spp, threads=threads, seed=seed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["explicit", "teleport-packed"])
 def test_a_small_sun_that_only_chance_finds_is_doubted(table: Table, level: str) -> None:
     """Whether it has been met or not: hardly ever is. A wide sun is trusted, and the small one that is aimed at."""
@@ -137,6 +138,7 @@ def test_a_small_sun_that_only_chance_finds_is_doubted(table: Table, level: str)
     assert aimed is not None and aimed.doubt is None
 
 
+@pytest.mark.slow
 def test_a_target_error_waits_for_suns_that_only_chance_finds(table: Table) -> None:
     """Lossless grains before an even sky have no noise at all until one has met the sun, so an error that is asked for
     is not reached, nor a picture black for good, before as many samples as show it; where light is aimed at, it is."""

@@ -53,6 +53,7 @@ def room(hole):
     return Scene(CAMERA, ONE, (), tuple(SurfaceSpec(side, (1.0, 1.0, 1.0)) for side in sides), name="room")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [CUBE, Sphere((0.5, 0.0, 0.0), 3.0), "mesh", "room"])
 def test_a_camera_shut_in_by_white_walls_is_refused(shape, tmp_path):
     """Paths there would never end. Walls that absorb end them, and the picture is black; a room with a hole and a
@@ -81,6 +82,7 @@ def heap(ball, radius, shape=CUBE, camera=None, absorption=0.0):
     return Scene(camera, ONE, (MediumSpec(shape, 0.5, radius, (grain,), "heap"),), name="heap")
 
 
+@pytest.mark.slow
 def test_grains_too_small_for_their_medium_are_refused(ball):
     """Grains of 1e-12 in a box of 4: a path without leaps would meet 1e12. Where they absorb, paths end, and the scene
     is built; from 1e5 grains on a note says how long it takes."""
@@ -98,6 +100,7 @@ def test_grains_too_small_for_their_medium_are_refused(ball):
     assert not world.build(heap(ball, 0.01), "teleport").notes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [CUBE, Sphere((0.0, 0.0, 0.0), 3.0), Slab(-1.0, 2.0), "mesh"])
 def test_the_mean_chord_is_that_of_cauchy(shape, ball, tmp_path):
     """4 V/S by hand, of a mesh that is scaled, turned and moved too."""

@@ -36,6 +36,7 @@ def test_belief() -> None:
     assert beliefs.of_bias(0.02) == (0.0, 0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", [prior.SPREAD, 2.0 * prior.SPREAD])
 @pytest.mark.parametrize("relative", [0.01, 0.03, 0.06, 0.3])
 def test_beliefs_are_calibrated(spread: float, relative: float) -> None:

@@ -69,6 +69,7 @@ def far(ball: tsdf.Table) -> Plan:
         return plan(pile(ball, 160.0), 0.05, threads=2)
 
 
+@pytest.mark.slow
 def test_a_dense_slab_seen_from_afar(far: Plan) -> None:
     """Spheres packed at 0.6 are too bright at teleport, and a plan knows; not so at teleport-memory. Explicit is right
     by definition. What is taken meets the target, and there are three lines that say so."""
@@ -84,6 +85,7 @@ def test_a_dense_slab_seen_from_afar(far: Plan) -> None:
     assert all(len(line) < 300 and "\n" not in line for line in (*far.why, *far.notes, *far.needs))
 
 
+@pytest.mark.slow
 def test_close_grains_are_met_one_by_one(ball: tsdf.Table) -> None:
     """Where a pixel covers a fifth of a grain no chain alone will do: explicit grains come first, or there are no
     others."""
@@ -94,6 +96,7 @@ def test_close_grains_are_met_one_by_one(ball: tsdf.Table) -> None:
     assert of(made, "teleport-memory", 16).floor.value < 0.5 * of(made, "teleport-memory").floor.value
 
 
+@pytest.mark.slow
 def test_what_is_measured_wins(ball: tsdf.Table) -> None:
     """The truth itself, taken for another level, is found without error; a level with light of its own is found out."""
     scene = pile(ball, 160.0)
@@ -112,6 +115,7 @@ def test_what_is_measured_wins(ball: tsdf.Table) -> None:
     assert picture.rgb.mean() == pytest.approx(seen.mean, rel=0.1)
 
 
+@pytest.mark.slow
 def test_other_wishes_other_choices(far: Plan, ball: tsdf.Table) -> None:
     """What is found is sorted by time to the target; a level of too much bias is never sure to meet it; with a time
     that is too short the least error is taken."""
@@ -127,6 +131,7 @@ def test_other_wishes_other_choices(far: Plan, ball: tsdf.Table) -> None:
     assert errors[0] <= planner.TIE * min(errors)
 
 
+@pytest.mark.slow
 def test_only_the_camera_matters_to_scenes_without_grains() -> None:
     floor = SurfaceSpec(Rectangle((0.0, 0.0, 0.0), (9.0, 0.0, 0.0), (0.0, 9.0, 0.0)), (0.5, 0.5, 0.5))
     scene = Scene(Camera((0.0, -9.0, 9.0), (0.0, 0.0, 0.0), 8, 6), LIGHTS, (), (floor,))
@@ -137,6 +142,7 @@ def test_only_the_camera_matters_to_scenes_without_grains() -> None:
 SUN = SunLight((0.6, 0.0, 0.8), (3.0, 3.0, 3.0), 0.53)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sky", [0.1, 0.0])
 def test_a_small_sun_is_left_to_levels_that_aim_at_it(ball: tsdf.Table, sky: float) -> None:
     """Single grains meet it once in 200,000 times; until then explicit is dark, or black, with no noise at all, and
@@ -162,6 +168,7 @@ def test_a_small_sun_is_left_to_levels_that_aim_at_it(ball: tsdf.Table, sky: flo
     assert found.rgb.mean() == pytest.approx(truth.rgb.mean(), rel=0.15)  # the level's bias and truth's noise of 3 %
 
 
+@pytest.mark.slow
 def test_what_single_grains_take_under_a_small_sun(ball: tsdf.Table) -> None:
     """Is about what a picture at level explicit has, under a sun that this meets often enough to tell: 4 degrees, a
     small part of what pilots look at. It is an upper bound, for not all of the variance is the sun's."""
@@ -172,6 +179,7 @@ def test_what_single_grains_take_under_a_small_sun(ball: tsdf.Table) -> None:
     assert 0.7 < said.variance / found < 2.0
 
 
+@pytest.mark.slow
 def test_light_that_goes_straight_on_finds_suns_by_chance() -> None:
     """Cubes let much of the light through parallel facets exactly straight on, along which no level aims: its variance
     grows as a sun shrinks, but for levels that know no such light. What is said of a sun of 4 degrees, by pilots of
@@ -190,6 +198,7 @@ def test_light_that_goes_straight_on_finds_suns_by_chance() -> None:
         assert of(made, level).variance == pytest.approx(pilot.seen.variance, rel=0.6)
 
 
+@pytest.mark.slow
 def test_where_there_is_nothing_to_see(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
     """Black scenes are planned, and nothing is said to be known of their noise; so are scenes without
     grains, or with none in sight. Those without light are refused."""
@@ -207,6 +216,7 @@ def test_where_there_is_nothing_to_see(ball: tsdf.Table, monkeypatch: pytest.Mon
         assert plan(Scene(away, lights, ()), 0.05, threads=1).why[0].startswith("take ")
 
 
+@pytest.mark.slow
 def test_tables_without_records(tmp_path: Path) -> None:
     """Levels that need them are left out, not fatal; what makes them is said."""
     table = tsdf.read(CHECKS / "cube.tsdf.exr")
@@ -220,6 +230,7 @@ def test_tables_without_records(tmp_path: Path) -> None:
     assert "no records by entry" in need and "--memory 64" in need
 
 
+@pytest.mark.slow
 def test_where_there_is_no_truth(ball: tsdf.Table) -> None:
     """No random packing is as dense as 0.7, so nothing is explicit: another level stands for the truth, that is said,
     and none claims to be without error. Nor is it piloted where a path meets millions of grains."""
@@ -242,6 +253,7 @@ def test_bad_targets(ball: tsdf.Table, target: float) -> None:
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.slow
 def test_auto_in_python(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
     """A scene that names no level is planned, one that does is not; a stop that is given is obeyed; what is chosen is
     rendered to the last bit as if it had been named."""
@@ -261,6 +273,7 @@ def test_auto_in_python(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> No
     assert shot.chosen(replace(scene, render=Render("volume", 5)), target_error=0.1)[1:4] == (None, None, 0.1)
 
 
+@pytest.mark.slow
 def test_without_a_stop_it_is_done_at_the_target(far: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     """Noise is what the target leaves beside bias and texture."""
     monkeypatch.setattr(shot, "plan", lambda *_: far)
@@ -269,6 +282,7 @@ def test_without_a_stop_it_is_done_at_the_target(far: Plan, monkeypatch: pytest.
     assert math.hypot(choice.target_error, far.chosen.floor.value) == pytest.approx(far.target)
 
 
+@pytest.mark.slow
 def test_nobody_waits_for_days(far: Plan, ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the target takes longer than a patient user waits, the least error in that time is taken, and it ends then;
     who asks for an error gets it, however long it takes; with samples per pixel their error is said."""

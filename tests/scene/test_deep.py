@@ -35,6 +35,7 @@ def test_isotropic_scatterers(w):
     assert abs(deep._reflectance(moments, 0.99 * w, math.inf) - expected) > 5e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("x", "depth"), [(1e-4, 5.0), (0.03, 0.5), (0.03, math.inf), (1.0, 50.0)])
 def test_slabs_against_discrete_ordinates(ball, depth, x):
     """PythonicDISORT with the table's moments, in diffuse light from above; beside it, twice the absorption."""

@@ -53,6 +53,7 @@ def loaded(name, folder, width):
     return replace(made, media=media, camera=replace(made.camera, width=width, height=max(1, width * 9 // 16)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "level"), [(name, level) for name in LEVELS for level in LEVELS[name]])
 def test_every_scene_renders(assets, name, level):
     """A few pixels of each scene at each of its levels are finite, lit, and no path is lost."""
@@ -64,6 +65,7 @@ def test_every_scene_renders(assets, name, level):
     assert picture.truncated + picture.faults == 0
 
 
+@pytest.mark.slow
 def test_the_meshes_are_closed_and_wound_outward(assets):
     """Each edge is shared by two faces that run along it in opposite ways, and the volume is positive."""
     for name in make_assets.MESHES:
@@ -98,6 +100,7 @@ def test_one_ball_lies_under_the_snow_and_one_half_in_it(assets):
     assert balls["red ball"] < -0.02
 
 
+@pytest.mark.slow
 def test_skies_stand_as_the_scenes_are_lit(assets):
     """The evening's warm side is -x, where the sun of sand.toml is; the studio's window is on the left of the camera
     that looks along +y, its warm strip on the right: by the directions that the renderer looks in."""

@@ -64,6 +64,7 @@ def test_mean_gap_is_exact(samples: list[Records]) -> None:
     assert abs(gap - mean_gap(0.95 * F)) > 4.0 * error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", ["exit_b2", "entry_b2"])
 def test_obliquity_is_uniform(samples: list[Records], end: str) -> None:
     """Lines meet spheres evenly: the first three moments of b2, along the lines alone, are those of [0, 1]."""
@@ -230,6 +231,7 @@ def walk(given: Law, eta: float, chains: int, block: int, seed: int) -> tuple[fl
     return float(each.mean()), float(each.std() / math.sqrt(chains))
 
 
+@pytest.mark.slow
 def test_spread_is_that_of_random_walks() -> None:
     """The linear equation against walks in space, step by step; control: without what azimuths remember."""
     given = shipped().tabulated(shipped().fractions.index(0.6))

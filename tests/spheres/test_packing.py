@@ -119,6 +119,7 @@ def test_thin_fluid_has_room_for_one_more_as_the_equilibrium_has(packings: dict[
     assert abs(poisson - theory) > 4.0 * error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fraction", [0.3, 0.45])
 def test_density_is_even(packings: dict[float, Packing], fraction: float) -> None:
     """The structure factor of the 13 longest waves is the compressibility of Carnahan & Starling, not that of chance.
@@ -158,6 +159,7 @@ def order(centres: np.ndarray, side: float) -> tuple[float, float, float]:
     return q6, float((friends >= 7).mean()), stretch
 
 
+@pytest.mark.slow
 def test_dense_packing_is_no_crystal(packings: dict[float, Packing]) -> None:
     """At 0.6 no bond order in the large, hardly a solid-like sphere, no neighbours at 2 sqrt 2 R, no preferred axis.
 
@@ -299,6 +301,7 @@ def test_walk_meets_what_brute_force_meets(fraction: float, kind: str) -> None:
         assert total > 20
 
 
+@pytest.mark.slow
 def test_limits_of_the_interval() -> None:
     """t_min is left out, t_max is in, a sphere around the origin is skipped, nothing found is infinity and -1."""
     packing = pack(0.3, 100, cache=False)
@@ -331,6 +334,7 @@ def test_rays_that_meet_nothing_end() -> None:
         next_sphere(cells, (0.0, 0.0, 0.0), (0.6, 0.0, 0.8), 0.0, bad)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fraction", [0.1, 0.3, 0.6])
 def test_mean_gap_between_spheres(packings: dict[float, Packing], fraction: float) -> None:
     """The mean chord of the void is 4 (1 - f) / (3 f), an exact theorem of any packing, within 4 standard errors.
@@ -359,6 +363,7 @@ def test_mean_gap_between_spheres(packings: dict[float, Packing], fraction: floa
 # ------------------------------------------------------------------------------------------ keeping, refusing
 
 
+@pytest.mark.slow
 def test_cache_keeps_and_heals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is kept is taken; what is damaged, another packing's or no packing at all is made anew, in silence."""
     monkeypatch.setenv("TSDF_CACHE", str(tmp_path / "new" / "folder"))

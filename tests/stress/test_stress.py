@@ -16,6 +16,7 @@ from click.testing import CliRunner, Result
 import tsdf
 from tsdf.cli.stress import FILES, ROWS, main
 from tsdf.errors import UsageError
+from tsdf.grain import exemplars
 from tsdf.scene.medium import Component, free_path
 from tsdf.stress import cells, naive, report, rows
 from tsdf.stress import own as own_rows
@@ -238,6 +239,8 @@ def test_an_interrupt_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.Mon
         (("scene.toml",), "is a scene; name a table"),
         (("--rows", "own-slab"), "it is about one table: name it"),
         (("--mesh", "x.stl"), "of the grain of a TABLE"),
+        (("salt", "--mesh", "no.obj", "--rows", "own-slab"), "--mesh: no.obj: "),
+        (("salt", "--mesh", ROOT, "--rows", "own-sums"), f"--mesh: {ROOT}: "),
         (("no.tsdf.exr",), "no.tsdf.exr"),
         (("snw",), "snw"),
         (("--threads", 0), "--threads"),
@@ -258,6 +261,34 @@ def test_a_row_that_cannot_be_measured_does_not_end_the_rest() -> None:
     found = rows.measure([row, made_up("one", "teleport", 0.1)], Setting())
     assert found.notes == ("none: no such thing",) and [one.row.name for one in found.done] == ["one"]
     assert "cannot be measured: none: no such thing" in report.terminal(found)
+
+
+@pytest.mark.parametrize(("arguments", "status"), [((), 0), (("--rows", "none,one,none"), 1)])
+def test_a_row_that_is_named_is_measured_or_missed(
+    arguments: tuple[str, ...], status: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once, however often it is named; that it cannot be is an error only if it is named."""
+
+    def measure(setting: Setting) -> Iterator[Measured]:
+        raise UsageError("no such thing")
+        yield
+
+    none = Row("none", "Made up", "none", "figure", "%", 1.0, measure)
+    monkeypatch.setattr(rows, "ROWS", (none, made_up("one", "teleport", 0.1)))
+    result = run(*arguments)
+    assert result.exit_code == status and result.stdout.count("cannot be measured: none: no such thing") == 1
+
+
+def test_the_mesh_of_another_grain_is_refused(tmp_path: Path) -> None:
+    """At once, and not after all the rows that ask for no mesh."""
+    vertices, faces = exemplars.cube(0.1)
+    mesh = tmp_path / "cube.off"
+    lines = ["OFF", f"{len(vertices)} {len(faces)} 0"]
+    lines += [" ".join(map(str, v)) for v in vertices] + [f"3 {' '.join(map(str, f))}" for f in faces]
+    mesh.write_text("\n".join(lines) + "\n")
+    result = run("salt", "--mesh", mesh, "--rows", "own-sums")
+    assert result.exit_code == 1 and result.stderr.count("\n") == 1
+    assert f"--mesh: {mesh} is not the grain the table was made of" in result.stderr
 
 
 @pytest.mark.slow

@@ -46,6 +46,7 @@ def tabulated(table: Table) -> float:
 # ---------------------------------------------------------------------------------------- bulk and slabs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["volume", "volume-hg", "isotropic"])
 def test_diffusion_of_point_scatterers_is_the_formula(level: str, table: Table, grain: GrainSpec) -> None:
     """Exponential free paths of mean l and a mean cosine g give 2 l^2 / (1 - g) per event, within 4 standard errors.
@@ -358,6 +359,7 @@ def file(table: Table, tmp_path: Path) -> str:
     return os.fspath(tmp_path / "sphere.tsdf.exr")
 
 
+@pytest.mark.slow
 def test_command_writes_the_reports(file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "new" / "out"
     words = [file, "--out", os.fspath(out), "--packing", "0.05", "--layer", "2", "--paths", "64"]

@@ -84,6 +84,7 @@ def of(found: Frontier, name: str) -> Measured:
     return next(row for row in found.rows if str(row.candidate) == name)
 
 
+@pytest.mark.slow
 def test_squares_have_no_bias(ball: Scene) -> None:
     """Level volume against itself, twelve times with four samples: the squared difference less the noise is zero within
     4.5 standard errors of the spread, also with the noise of one alone taken off, when that of the other is left.
@@ -103,6 +104,7 @@ def test_squares_have_no_bias(ball: Scene) -> None:
     assert same.value < -2.0 * SIGMAS * same.error
 
 
+@pytest.mark.slow
 def test_all_candidates_are_measured(found: Frontier) -> None:
     """Each has its row, best level first, eight runs, and the times at which its samples double."""
     assert [row.candidate for row in found.rows] == list(ALL)
@@ -117,6 +119,7 @@ def test_all_candidates_are_measured(found: Frontier) -> None:
             assert mean_of(row.curve[0][1]).value > mean_of(row.curve[-1][1]).value
 
 
+@pytest.mark.slow
 def test_what_is_known_of_levels_is_found(found: Frontier) -> None:
     """The truth's own level, measured as all others, differs by nothing: the control. Every chain without explicit
     grains has the texture of single grains missing; the chain that forgets where light left the last grain, and fills
@@ -272,6 +275,7 @@ def test_pictures_that_fill_the_memory_are_refused(ball: Scene) -> None:
         frontier.measure(large, [Candidate("volume")], 0.2, 10, threads=1)
 
 
+@pytest.mark.slow
 def test_a_scene_without_grains_is_the_same_at_all_levels(ball: Scene) -> None:
     """Nothing to pack, no medium to have sides or a rim: the plate alone, without a floor that is seen."""
     made = frontier.measure(replace(ball, media=()), candidates(("explicit", "volume")), 0.2, 3, threads=1)
@@ -454,6 +458,7 @@ def status(*words: object) -> int:
     return int(str(caught.value.code))
 
 
+@pytest.mark.slow
 def test_command_writes_results_and_draws_them_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two scenes and the chart of both; from the saved results the same bytes, also into the same folder."""
     for name in ("one", "two"):

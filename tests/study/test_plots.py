@@ -57,6 +57,7 @@ def test_atoms_are_marked(tables):
     assert len(axes_of(figure, r"p(z\,").collections) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["cube", "cube_identity", "sphere"])
 def test_the_legend_covers_nothing(tables, name):
     """It stands clear of the axes and of the labels of atoms, and has a line for each curve."""
@@ -74,11 +75,13 @@ def test_the_legend_covers_nothing(tables, name):
     assert len(legend.get_texts()) == len(figure.axes[0].get_legend_handles_labels()[0]) >= 3
 
 
+@pytest.mark.slow
 def test_a_table_that_is_all_atom(tables):
     for draw in (plots.plot_table, plots.plot_validation):
         assert draw(tables["cube_identity"]).axes
 
 
+@pytest.mark.slow
 def test_the_validation_of_a_sphere_is_figure_8(tables):
     axes = plots.plot_validation(tables["sphere"]).axes[0]
     assert (axes.get_xlim(), axes.get_ylim()) == ((0.0, 180.0), (0.01, 100.0))
@@ -112,6 +115,7 @@ def test_outputs_that_cannot_be(tables, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["folder.png"]
 
 
+@pytest.mark.slow
 def test_no_global_state():
     """Importing plots imports no matplotlib; drawing keeps its settings."""
     script = (

@@ -11,6 +11,7 @@ from tsdf.study.ranking import best, floor_of, jackknife, mean_of, places, ranke
 RUNS, REPEATS = 10, 300
 
 
+@pytest.mark.slow
 def test_not_one_wrong_order_in_twenty() -> None:
     """Eight candidates that are equal, and a shared part in each run that is ten times the rest: a family of pairs has
     a wrong order in at most 5 % of the repetitions, within 3 standard errors of as many.
@@ -98,6 +99,7 @@ def test_the_best_and_those_that_may_be_as_good() -> None:
     assert {first, *others} == {1, 2}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 5, 12])
 def test_the_best_of_equals_is_not_surely_the_best(count: int) -> None:
     """Of equal candidates any is called worse in at most 5 % of the repetitions, within 3 standard errors of as many;

@@ -85,6 +85,7 @@ def test_discrete_ordinates(family: Family, found: Spectrum, thickness: float, m
     assert far(wrong[0], np.maximum(wrong[1], 0.0))[0].max() > 2.0 * WITHIN
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["teleport", "teleport-joint", "teleport-memory", "volume-hg", "isotropic"])
 def test_levels_are_those_of_the_renderer(family: Family, found: Spectrum, level: str) -> None:
     """A slab at each level against paths that are followed with one absorption, as `experiment` does; other paths."""
@@ -102,6 +103,7 @@ def test_levels_are_those_of_the_renderer(family: Family, found: Spectrum, level
         assert (off < SIGMAS * error).all(), (level, i, off, error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["volume", "teleport", "teleport-memory"])
 def test_layers_add_up(family: Family, found: Spectrum, level: str) -> None:
     """What comes back, what the ground keeps and what layers absorb is all the light, before it is made to be: sums of
@@ -124,6 +126,7 @@ def test_layers_add_up(family: Family, found: Spectrum, level: str) -> None:
     assert deeper[-1] < 0.2 and deeper[1] > 0.3
 
 
+@pytest.mark.slow
 def test_ground(family: Family, found: Spectrum) -> None:
     """White ground under lossless-as-can-be grains sends all back; grey ground is the series of what goes to and fro,
     and a half-space knows no ground."""
@@ -140,6 +143,7 @@ def test_ground(family: Family, found: Spectrum) -> None:
     assert Request("volume", FRACTION, math.inf, 0.6, ground=0.5).lights == (0.6,)
 
 
+@pytest.mark.slow
 def test_the_same_for_any_number_of_threads(family: Family, found: Spectrum) -> None:
     request = Request("teleport", FRACTION, 5.0)
     one, two = (slabs.measure(family, found, request, threads=k, paths=9000) for k in (1, 2))
@@ -150,6 +154,7 @@ def test_the_same_for_any_number_of_threads(family: Family, found: Spectrum) -> 
             < SIGMAS * np.hypot(one.reflectance_error, other.reflectance_error) + 1e-9).all()  # fmt: skip
 
 
+@pytest.mark.slow
 def test_thinned_paths_are_unbiased(family: Family, found: Spectrum, monkeypatch: pytest.MonkeyPatch) -> None:
     """Long paths thinned, as with a profile, against paths that are all followed to their end, and against leaps: the
     same, but noisier where light comes back nearly whole. A share that is not made up for would take a tenth of it."""

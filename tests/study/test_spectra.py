@@ -77,6 +77,7 @@ def test_what_lies_between_is_within_the_stated_error() -> None:
     assert straight[1] == pytest.approx(own_straight := build.table().deflection_masses()[-1], abs=5e-3), own_straight
 
 
+@pytest.mark.slow
 def test_moments_between_tables_are_no_clipped_polynomials(ice: Constants, family: Family, found: Spectrum) -> None:
     """Rainbows move with n, and polynomials through cells would be negative; moments and their g agree everywhere, and
     the phase functions for reading are nowhere negative."""
@@ -136,6 +137,7 @@ def test_wavelengths_that_are_none(text: str) -> None:
         spectra.wavelengths(text)
 
 
+@pytest.mark.slow
 def test_tables_that_make_no_family(ice: Constants) -> None:
     ball = found_tables(1.3, 1.31)
     cube = load_grain("cube")

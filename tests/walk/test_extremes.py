@@ -131,6 +131,7 @@ def test_judged_and_drawn(name: str, tmp_path: Path) -> None:
         plots.save(draw(EXTREMES[name]), tmp_path / "t.png")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["volume", "volume-hg", "isotropic"])
 @pytest.mark.parametrize("name", EXTREMES)
 def test_scenes(name: str, level: str, tmp_path: Path) -> None:

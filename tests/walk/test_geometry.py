@@ -42,6 +42,7 @@ def directions(rng, n):
     return d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "shape"), SHAPES)
 def test_exact_hit_is_where_the_depth_changes_sign(kind, shape):
     """Along the ray the depth keeps its sign up to the distance found and has the other beyond: independent of how the
@@ -159,6 +160,7 @@ def test_clearance_is_a_bound(shape, bumpy, table):
     assert not (bound <= 0.5 * true).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["mesh", "box"])
 def test_ways_that_are_sure_to_meet_nothing(shape, bumpy, table):
     """Of ways from places in a medium those that are sure meet nothing, by the ray engine, the depth at their ends and
@@ -194,6 +196,7 @@ def test_ways_that_are_sure_to_meet_nothing(shape, bumpy, table):
             assert sure[free & (met > 1.01 * far)].mean() > 0.95 and 0.3 < sure.mean() < 0.9
 
 
+@pytest.mark.slow
 def test_distances_bound_those_of_each_cell(bumpy, table):
     """No cell's number is above its centre's distance to the nearest facet, nor short by two diagonals of a cell."""
     made = placed(table, Mesh(bumpy))
@@ -210,6 +213,7 @@ def test_distances_bound_those_of_each_cell(bumpy, table):
         assert (true - cells < 2.0 * math.sqrt(3.0) * step).all()
 
 
+@pytest.mark.slow
 def test_overlap_is_refused_and_touching_is_not(bumpy, table):
     """Media that share room are refused in one line with a place; media that only share a face are not."""
     low, high = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), Box((0.0, 0.0, 1.0), (1.0, 1.0, 2.0))

@@ -83,6 +83,7 @@ def test_first_facets(cells: int) -> None:
     assert ((met == true) | (met == -1) | (t > end[:, None]))[known].all() and others.any()
 
 
+@pytest.mark.slow
 def test_as_the_ray_engine() -> None:
     """Embree names the same facets, but for rays that pass an edge within its rounding."""
     corners = ball(3)

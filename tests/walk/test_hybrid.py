@@ -100,6 +100,7 @@ def picture(scene: Scene, level: str, spp: int = 16, threads: int = 2, seed: int
 # ---------------------------------------------------------------------------------------------- the two ends
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inside", ["grains", "centres"])
 def test_with_many_it_is_the_explicit_level(heap: Scene, inside: str) -> None:
     """to the last bit: the same packing, the same grains and the same random numbers, whatever the chain. With two
@@ -112,6 +113,7 @@ def test_with_many_it_is_the_explicit_level(heap: Scene, inside: str) -> None:
         assert not np.array_equal(picture(asking(heap, 2, inside), level).rgb, truth.rgb)
 
 
+@pytest.mark.slow
 def test_with_none_nothing_is_packed(heap: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """and the chain has one place and one handle, as if there were no other way."""
     monkeypatch.setattr(explicit, "pack", lambda *_: pytest.fail("a packing is made"))
@@ -121,6 +123,7 @@ def test_with_none_nothing_is_packed(heap: Scene, monkeypatch: pytest.MonkeyPatc
     assert walkers.near is walkers.arrays and walkers.near_batches == walkers.batches
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", CHAINS)
 def test_the_same_for_any_number_of_threads(heap: Scene, level: str) -> None:
     scene = asking(heap, 2, "centres")
@@ -180,6 +183,7 @@ def one_mirror(ball: Table, radius: float) -> World:
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [1.0, 0.004])
 def test_the_state_at_the_hand_over(ball: Table, radius: float) -> None:
     """A mirror is met at a known point: from there light goes on along the mirrored direction, on the
@@ -207,6 +211,7 @@ def test_the_state_at_the_hand_over(ball: Table, radius: float) -> None:
         assert w["t"] == pytest.approx(t, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_the_next_sphere_is_that_of_the_packing(ball: Table) -> None:
     """Where light leaves the second sphere, the next sphere of the very packing and the one that the chain draws are
     alike in how far their centre is from the one left, and in how its two normals point to one side. With the side
@@ -285,6 +290,7 @@ def test_reflectance_of_a_layer(ball: Table, sky: Path) -> None:
     assert abs(nearer) < 0.5 * difference + SIGMAS * error
 
 
+@pytest.mark.slow
 def test_single_grains_show(ball: Table, sky: Path) -> None:
     """The squared error of pixels, half an R wide, falls from none to three to ten explicit grains: from independent
     halves, so that noise has no part in the mean."""
@@ -304,6 +310,7 @@ def test_single_grains_show(ball: Table, sky: Path) -> None:
     assert square[0] > 1.5 * square[1] > 2.25 * abs(square[2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["teleport-memory", "teleport"])
 def test_a_sun_looked_for_and_a_sun_found(heap: Scene, level: str) -> None:
     """Aimed light follows the rule: from the floor and from the chain it changes no mean, and a twentieth of the light
@@ -335,6 +342,7 @@ def test_levels_that_cannot_take_it(heap: Scene, level: str, why: str) -> None:
         world.build(asking(heap, 5), level)
 
 
+@pytest.mark.slow
 def test_what_is_said(heap: Scene, ball: Table) -> None:
     """Of packings that cannot be, of mirrors, and of lights that are found by chance."""
     dense = replace(heap, media=(replace(heap.media[0], packing_fraction=0.7),))
@@ -362,6 +370,7 @@ def test_what_is_said(heap: Scene, ball: Table) -> None:
         assert len(said) == thin
 
 
+@pytest.mark.slow
 def test_a_grain_of_a_file(tmp_path: Path, heap: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its mesh is found beside the table, else in the scene's folder, never in the folder one happens to be in; what is
     not that grain is refused before anything is packed."""
@@ -415,6 +424,7 @@ def test_fewer_where_a_pixel_covers_more() -> None:
     assert abs(met[half, 32] - 4.0 * math.log(2.0)) <= 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["teleport-memory", "teleport"])
 def test_pixels_with_fewer(heap: Scene, level: str) -> None:
     """A pixel that counts all grains as met is the chain's, one that counts none the hybrid's, to the last bit, side by

@@ -87,6 +87,7 @@ def deviation(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.nd
     return np.asarray((one[0] - other[0]) / np.hypot(one[1], other[1]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["teleport-memory", "teleport"])
 def test_slabs_send_the_same_light_back(level: str, ball: Table) -> None:
     """Reflectance, transmittance, what absorption leaves and what comes back near the beam, of a slab of about seven
@@ -118,6 +119,7 @@ def test_mixtures_and_grains_that_are_missed(ball: Table, cube: Table) -> None:
         assert deviation(light(leapt, 40_000, 1), truth)[2] < -4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", LEVELS)
 def test_a_furnace_is_exact(level: str, ball: Table) -> None:
     """Lossless grains under constant light are as bright as it to the last bit, and leaps are what light crosses them
@@ -136,6 +138,7 @@ def sun(angle: float) -> SunLight:
     return SunLight((0.3, 0.2, 1.0), (3.0, 3.0, 3.0), angle)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["teleport-memory", "teleport", "isotropic"])
 @pytest.mark.parametrize("angle", [0.53, 25.0])
 def test_light_that_is_aimed_is_not_lost(level: str, angle: float, ball: Table) -> None:
@@ -260,6 +263,7 @@ def test_records_are_kept_and_made_again_when_the_table_changes(
     assert count[0] == 4 and all((a == b).all() for a, b in zip(first, again, strict=True))
 
 
+@pytest.mark.slow
 def test_lengths_are_those_of_all_that_were_tried(ball: Table, cube: Table, monkeypatch: pytest.MonkeyPatch) -> None:
     """Matter crossed per grain met, of each kind in a mixture, is known better than the records that are kept know it:
     within 4 standard errors of sixteen times as many, where that of as many is off by more than half of this."""
@@ -287,6 +291,7 @@ def replaced(one: Law) -> Law:
     return one._replace(gap=gap)
 
 
+@pytest.mark.slow
 def test_records_are_the_same_for_any_number_of_threads(ball: Table) -> None:
     made = build(slab(ball), "teleport", leap=0.0)
     chain = Chain(made.media, made.tables, made.memory)

@@ -239,6 +239,7 @@ def test_slabs_of_point_scatterers(ball: Table, sky: Path, level: str, depth: fl
 # ------------------------------------------------------------------------------------------- absorption
 
 
+@pytest.mark.slow
 def test_energy_absorbed_at_an_event(ball: Table, sky: Path) -> None:
     """In a slab too thin for second events, each takes 1 - albedo of the light: exp(-sigma_a l) averages to albedo."""
     for level in ("volume", "volume-hg"):
@@ -272,6 +273,7 @@ def test_channels_are_renders_of_their_own(ball: Table, level: str) -> None:
             assert abs(alone_seen.rgb[channel] - together.rgb[channel - 1]) > SIGMAS * error
 
 
+@pytest.mark.slow
 def test_spectra(ball: Table) -> None:
     """A flat spectrum is grey, nothing absorbed is white, and ice is the weighted mean of its wavelengths."""
 
@@ -303,6 +305,7 @@ def test_spectra(ball: Table) -> None:
 # -------------------------------------------------------------------------------------------- mixtures
 
 
+@pytest.mark.slow
 def test_a_mixture_of_a_grain_with_itself(ball: Table, sky: Path) -> None:
     """is that grain alone, whatever the fractions."""
     twice = (GrainSpec(ball, 0.3), GrainSpec(ball, 0.7))
@@ -311,6 +314,7 @@ def test_a_mixture_of_a_grain_with_itself(ball: Table, sky: Path) -> None:
         assert agree(alone, mixed), level
 
 
+@pytest.mark.slow
 def test_grains_are_chosen_by_their_share(ball: Table, cube: Table, sky: Path) -> None:
     """Grains of a packing by number, grains that light meets by number times hit probability."""
     grains = (GrainSpec(ball, 1.0), GrainSpec(cube, 3.0))
@@ -325,6 +329,7 @@ def test_grains_are_chosen_by_their_share(ball: Table, cube: Table, sky: Path) -
     assert abs(count - 0.73 * n) > SIGMAS * math.sqrt(n * 0.73 * 0.27)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mixed", [False, True])
 def test_grains_that_are_often_missed(ball: Table, cube: Table, sky: Path, mixed: bool) -> None:
     """Teleportation through cubes (hit probability 0.64) is near the truth: 0.02, where leaving the misses out of the
@@ -352,6 +357,7 @@ def chi_square_p(counts: np.ndarray, expected: np.ndarray) -> float:
     return float(chi2.sf(((counts - expected)[keep] ** 2 / expected[keep]).sum(), keep.sum() - 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kept_apart", [False, True])
 def test_deflections_of_the_exact_sphere(kept_apart: bool) -> None:
     """Light followed through one sphere leaves as its table says, which comes from an integral; at 1.34 it does not."""
@@ -385,6 +391,7 @@ def test_rotations_are_uniform() -> None:
     assert back == pytest.approx((0.6, 0.0, 0.8), abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_sphere_of_facets_is_a_sphere(ball: Table, sky: Path) -> None:
     """The ray engine's way through 5120 facets and the formula's agree within the noise and the facets' 0.025."""
     facets = traced("icosphere", 1.33, 20_000, subdivisions=4)
@@ -393,6 +400,7 @@ def test_a_sphere_of_facets_is_a_sphere(ball: Table, sky: Path) -> None:
     assert far < 0.025 * made[0].rgb[0] + SIGMAS * math.hypot(made[0].error[0], made[1].error[0])
 
 
+@pytest.mark.slow
 def test_light_leaves_a_traced_grain_as_its_table_says(cube: Table) -> None:
     """One cube lit from a random side: deflections from the packed grains' kernels and from the scatterometer."""
     scene = scene_of(Sphere((0.0, 0.0, 0.0), 4.0), 0.1, cube, WHITE, packing_spheres=64)

@@ -118,11 +118,13 @@ def same_everywhere(lights, u):
     return worst
 
 
+@pytest.mark.slow
 def test_draw_pdf_and_radiance_agree():
     """The density of a draw is `pdf` there, its colour is `radiance` less the constant, and equal densities halve."""
     assert same_everywhere(scene(), np.random.default_rng(2).random((100_000, 3))) < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("u", [0.0, 0.5, 1.0 - 2.0**-53])
 def test_the_ends_of_the_random_numbers(u):
     """No random number leads to a light that is not there, or out of an array; a density of 0 brings no light."""
@@ -209,6 +211,7 @@ def quadrature(n, constant, environment, rotation_deg, suns, fine=60):
     return total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [(0.0, 0.0, 1.0), (0.6, -0.48, 0.64), (-0.36, 0.48, -0.8)])
 def test_every_route_to_the_irradiance_agrees(n):
     """Draws, uniform directions, both weighted, and quadrature agree within 4.5 standard errors of the data.

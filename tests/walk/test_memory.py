@@ -70,6 +70,7 @@ def apart(a: tuple[float, float], b: tuple[float, float]) -> float:
 # ------------------------------------------------------------------------------------------------ records
 
 
+@pytest.mark.slow
 def test_records_in_their_frame(ball: Table, cube: Table) -> None:
     """Directions and sides are unit and perpendicular, exits lie on the sphere ahead of the light, entry and exit are
     as far apart as the table says."""
@@ -213,6 +214,7 @@ def test_cubes_diffuse_as_single_grains_do(cube: Table) -> None:
     assert apart(own[:2], truth) < 4.0
 
 
+@pytest.mark.slow
 def test_grains_whole_inside_are_centres_inside_a_smaller_shape(ball: Table, above: Path, tmp_path: Path) -> None:
     """The two conventions are one, a radius apart; a mesh of the shape says the same."""
     import trimesh
@@ -264,6 +266,7 @@ def test_what_cannot_be_is_said(ball: Table, above: Path) -> None:
 # ------------------------------------------------------------------------------------------------ out of bounds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shadow", [0, 1])
 def test_light_that_is_out_of_bounds_ends(ball: Table, tmp_path: Path, shadow: int) -> None:
     """A walker that is outside of a mesh and believes it is inside meets no grain for ever: it is counted as lost."""

@@ -65,6 +65,7 @@ def reflectance(level: str, shape: object, grains: tuple, spp: int, seed: int = 
 # ----------------------------------------------------------------------------------------- spheres around
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fraction", "spheres"), [(0.1, 300), (0.6, 64), (0.6, 600)])
 def test_spheres_around_are_those_that_lines_meet(fraction: float, spheres: int) -> None:
     """Light that leaves a sphere anywhere meets the sphere that a walk through the finer grid finds, near or far, and
@@ -95,6 +96,7 @@ def test_spheres_around_are_those_that_lines_meet(fraction: float, spheres: int)
 # ---------------------------------------------------------------------------------------------- the level
 
 
+@pytest.mark.slow
 def test_mirrors_diffuse_as_in_their_packing(mirror: Table) -> None:
     """Light that is sent back finds the mirror that it came from: mean squared displacement per event, packing by
     packing. A chain that remembers one sphere is far off."""
@@ -104,6 +106,7 @@ def test_mirrors_diffuse_as_in_their_packing(mirror: Table) -> None:
     assert apart(diffusion("teleport-memory", grain, 0.6, 1200, seed=7)[:2], truth[:2]) > 6.0
 
 
+@pytest.mark.slow
 def test_cubes_diffuse_as_in_their_packing(cube: Table) -> None:
     """Grains that are often missed, which light passes straight; passed as if hit, they would be seen."""
     grain = GrainSpec(cube)
@@ -115,6 +118,7 @@ def test_cubes_diffuse_as_in_their_packing(cube: Table) -> None:
     assert apart((never_missed.mean[0], never_missed.error[0]), truth[:2]) > 6.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cosine", [1.0, 0.5])
 def test_slabs_of_spheres(ball: Table, cosine: float) -> None:
     """Reflectance and transmittance of a thin, dense slab of the same spheres, traced and not."""
@@ -127,6 +131,7 @@ def test_slabs_of_spheres(ball: Table, cosine: float) -> None:
     assert apart((other.transmittance, other.transmittance_error), (truth.transmittance, truth.transmittance_error)) > 4
 
 
+@pytest.mark.slow
 def test_slabs_of_cubes_that_absorb(cube: Table) -> None:
     """Reflectance of grains with facets that take light."""
     grain = GrainSpec(cube, absorption=Absorption("grey", (0.1,)))
@@ -136,6 +141,7 @@ def test_slabs_of_cubes_that_absorb(cube: Table) -> None:
     assert apart((other.reflectance, other.reflectance_error), (truth.reflectance, truth.reflectance_error)) > 4.0
 
 
+@pytest.mark.slow
 def test_kinds_have_their_places(ball: Table, cube: Table) -> None:
     """In a mixture each place holds the kind that it holds when it is traced."""
     mixed = (GrainSpec(ball, 1.0, absorption=Absorption("grey", (5.0,))), GrainSpec(cube, 2.0))
@@ -144,6 +150,7 @@ def test_kinds_have_their_places(ball: Table, cube: Table) -> None:
     assert apart(reflectance(LEVEL, Slab(-8.0, 0.0), mixed[1:], 20_000, 2), truth) > 6.0
 
 
+@pytest.mark.slow
 def test_grains_stand_where_they_do_when_traced(ball: Table, tmp_path) -> None:
     """Both conventions of `inside`, boxes exact and of facets."""
     import trimesh

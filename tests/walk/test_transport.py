@@ -158,6 +158,7 @@ def black(shape) -> SurfaceSpec:
 # ------------------------------------------------------------------------------------------------ furnace
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("shape", ["slab", "box", "ball", "convex", "concave"])
 def test_furnace_of_constant_light_is_exact(shape, level, folder, ball):
@@ -216,6 +217,7 @@ def test_furnace_of_optical_thickness_1000(level, ball):
         assert picture.truncated == picture.faults == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", LEVELS)
 def test_furnace_of_traced_grains(level, folder, cube):
     """The furnace is 1 for grains with facets, atoms of p_theta and rays that miss them."""

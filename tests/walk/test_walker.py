@@ -19,6 +19,7 @@ def test_exponentials() -> None:
     assert 0.0 <= power(-1e6) < 1e-300 and power(-math.inf) < 1e-300
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("amounts", [(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.02, 1.5, 0.7), (40.0, 0.0, 9.0)])
 def test_colour_that_is_left(amounts: tuple[float, ...]) -> None:
     """The sum over wavelengths and channels as it is written down; nothing crossed is white, exactly."""

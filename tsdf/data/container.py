@@ -230,6 +230,13 @@ def write(header: dict[str, Any], pixels: np.ndarray, path: str | os.PathLike[st
         raise TSDFError(f"cannot write {shown(path)}: {shown(error)}") from error
 
 
+def get_ready(form: Format[Any]) -> None:
+    """Load what writing asks for, which takes as long as all else of it: for a thread beside other work."""
+    import OpenEXR  # noqa: F401
+
+    _validator(form.schema)
+
+
 def _write_checked(header: dict[str, Any], pixels: np.ndarray, path: Path, form: Format[Any]) -> None:
     import OpenEXR
 

@@ -143,6 +143,11 @@ def inspect(data: bytes) -> tuple[Table | None, list[Finding]]:
     return container.inspect(data, FORMAT)
 
 
+def get_ready() -> None:
+    """Load what writing a table asks for: for a thread beside other work."""
+    container.get_ready(FORMAT)
+
+
 def write(table: Table, path: str | os.PathLike[str]) -> None:
     """Write a table; the same table gives the same bytes.
 

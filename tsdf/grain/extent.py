@@ -112,14 +112,20 @@ def _frames(d: Floats) -> Floats:
 
 def _rotation(turn: Floats) -> Floats:
     """Return the rotation (3, 3) by a vector: about it, by its length [rad] (Rodrigues)."""
-    angle = math.sqrt(turn @ turn)
-    x, y, z = turn
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    if angle < 1e-12:
-        return np.eye(3) + cross
-    c, s = (1.0 - math.cos(angle)) / angle**2, math.sin(angle) / angle
-    rotation: Floats = np.eye(3) + s * cross + c * (cross @ cross)
-    return rotation
+    x, y, z = turn.tolist()  # thousands are asked for, one by one
+    square = x * x + y * y + z * z
+    if square < 1e-24:
+        c, s = 0.5, 1.0
+    else:
+        angle = math.sqrt(square)
+        c, s = (1.0 - math.cos(angle)) / square, math.sin(angle) / angle
+    return np.array(
+        [
+            [1.0 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y],
+            [c * x * y + s * z, 1.0 - c * (x * x + z * z), c * y * z - s * x],
+            [c * x * z - s * y, c * y * z + s * x, 1.0 - c * (x * x + y * y)],
+        ]
+    )
 
 
 def _extremes(points: Floats) -> Floats:

@@ -9,6 +9,7 @@ facets are wound so that their geometric normal points from the material to the 
 import hashlib
 import os
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -48,6 +49,7 @@ MOST_TILT = (
 )
 MOST_REPAIRED = 0.1  # share of the surface that closing holes may make without being asked
 RAY_OFFSET = 1e-5  # [R] restart distance off a facet along its normal: 1e-7 to 1e-4 leave no self-hits
+RAYS_AT_ONCE = 8192  # test rays that a thread follows together
 LARGEST_COORDINATE = 1e100  # squares and products of coordinates must stay finite in float64
 
 
@@ -320,7 +322,7 @@ def embree_scene(grain: Grain) -> Any:
 
 
 def triangle_scene(vertices: ArrayLike, faces: ArrayLike, name: str = "mesh") -> Any:
-    """Return the robust Embree scene of any triangles, as `embree_scene` does for a grain's."""
+    """Return the robust Embree scene of any triangles, as `embree_scene` does for a grain's; threads may share it."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
@@ -332,6 +334,7 @@ def triangle_scene(vertices: ArrayLike, faces: ArrayLike, name: str = "mesh") ->
         raise GrainError(f"{name}: the mesh is damaged; make it by grain_from_mesh")
     scene = EmbreeScene(robust=True)
     TriangleMesh(scene, corners, triangles)  # copied into the scene, which owns it
+    scene.run(corners[:1], np.ones((1, 3), np.float32))  # builds its tree, so that threads can share it
     return scene
 
 
@@ -429,26 +432,34 @@ def _gap_on_ray(grain: Grain, origin: Floats, direction: Floats) -> Floats | Non
 
 def _broken_rays(grain: Grain, scene: Any, origin: Floats, direction: Floats) -> tuple[NDArray[np.bool_], Floats]:
     """Return which rays do not enter and leave in turn, and where each ray was last."""
-    along = direction.astype(np.float32).astype(np.float64)  # the ray Embree sees
-    at = origin.astype(np.float32).astype(np.float64)
     faces = grain.faces.astype(np.int64)
     normal = area_normals(grain.vertices, faces)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     level = np.einsum("ij,ij->i", normal, grain.vertices[faces[:, 0]])
-    inside, bad = np.zeros(len(at), bool), np.zeros(len(at), bool)
-    active = np.arange(len(at))
-    while len(active):
-        face = first_hit(scene, at[active], along[active])
-        missed = active[face < 0]
-        bad[missed] = inside[missed]
-        active, face = active[face >= 0], face[face >= 0]
-        n, d = normal[face], along[active]
-        slope = np.einsum("ij,ij->i", d, n)
-        leaving = slope > 0
-        bad[active] = (inside[active] != leaving) | (np.abs(slope) < 1e-7)
-        inside[active] = ~leaving
-        step = (level[face] - np.einsum("ij,ij->i", at[active], n)) / np.where(slope == 0, 1.0, slope)
-        beyond = at[active] + step[:, None] * d + np.copysign(RAY_OFFSET, slope)[:, None] * n
-        at[active] = beyond.astype(np.float32)
-        active = active[~bad[active] & (np.abs(beyond) < 4).all(axis=1)]
-    return bad, at
+    ends, bad = np.empty(origin.shape), np.zeros(len(origin), bool)
+
+    def follow(first: int) -> None:
+        part = slice(first, first + RAYS_AT_ONCE)
+        along = direction[part].astype(np.float32).astype(np.float64)  # the ray Embree sees
+        at = ends[part]
+        at[...] = origin[part].astype(np.float32)
+        inside, broken = np.zeros(len(at), bool), bad[part]
+        active = np.arange(len(at))
+        while len(active):
+            face = first_hit(scene, at[active], along[active])
+            missed = active[face < 0]
+            broken[missed] = inside[missed]
+            active, face = active[face >= 0], face[face >= 0]
+            n, d = normal[face], along[active]
+            slope = np.einsum("ij,ij->i", d, n)
+            leaving = slope > 0
+            broken[active] = (inside[active] != leaving) | (np.abs(slope) < 1e-7)
+            inside[active] = ~leaving
+            step = (level[face] - np.einsum("ij,ij->i", at[active], n)) / np.where(slope == 0, 1.0, slope)
+            beyond = at[active] + step[:, None] * d + np.copysign(RAY_OFFSET, slope)[:, None] * n
+            at[active] = beyond.astype(np.float32)
+            active = active[~broken[active] & (np.abs(beyond) < 4).all(axis=1)]
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(follow, range(0, len(origin), RAYS_AT_ONCE)))
+    return bad, ends

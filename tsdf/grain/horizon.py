@@ -1,6 +1,8 @@
 """Horizon map: what stands before a facet, from how low an elevation on light comes and goes unobstructed."""
 
 import math
+import os
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +15,7 @@ LEAF = 16  # vertices in the smallest group of the search for what stands before
 FREQUENCY = 4  # steps along an edge of the octahedron whose grid of directions bounds groups of vertices
 CHUNK = 65536  # facets at a time
 GROUP = 16  # facets, one after the other in the mesh, that are passed over together where they cannot matter
+PIECE = 2048  # facets that are worth a thread
 UNKNOWN = 2.0  # horizon of a facet of which nothing is promised: no sine exceeds it
 
 
@@ -39,40 +42,50 @@ def _gap(corners, i, j, axis):
 
 
 @njit(**KERNEL)
-def _groups(facets, spheres):
-    """Write centre and radius of a sphere around each `GROUP` of facets into `spheres` (groups, 4)."""
-    for g in range(len(spheres)):
-        members = range(g * GROUP, min((g + 1) * GROUP, len(facets.faces)))
+def _around(spheres, groups):
+    """Write centre and radius of a sphere around each `GROUP` of spheres (n, 4) into `groups` (n / GROUP, 4)."""
+    for g in range(len(groups)):
+        members = range(g * GROUP, min((g + 1) * GROUP, len(spheres)))
         for j in members:
             for k in range(3):
-                spheres[g, k] += facets.centroids[j, k] / len(members)
+                groups[g, k] += spheres[j, k] / len(members)
         for j in members:
-            off = step(triple(facets.centroids[j]), -1.0, triple(spheres[g]))
-            spheres[g, 3] = max(spheres[g, 3], math.sqrt(dot(off, off)) + facets.radii[j] + 1e-12)
+            off = step(triple(spheres[j]), -1.0, triple(groups[g]))
+            groups[g, 3] = max(groups[g, 3], math.sqrt(dot(off, off)) + spheres[j, 3] + 1e-12)
 
 
 @njit(**KERNEL)
-def _rise(facets, obstructed, spheres, horizon):
+def _rise(facets, obstructed, groups, groups_of_groups, horizon):
     """Write into `horizon` a bound on the sine of the elevation of the grain over the facets listed.
 
-    It is the largest that any other facet demands, in whatever order they are asked: first those that are near in the
-    mesh, which lets most groups of others be passed over.
+    It is the largest that any other facet demands, in whatever order they are asked: first what the facet before this
+    one owed its bound to, then those that are near in the mesh, which lets most groups of others be passed over.
     """
+    highest = 0
     for i in obstructed:
-        top, n, centroid, groups = 0.0, triple(facets.normals[i]), triple(facets.centroids[i]), len(spheres)
-        for k in range(groups):
-            g = (i // GROUP + k) % groups
-            apart, radius = step(triple(spheres[g]), -1.0, centroid), spheres[g, 3]
-            above = dot(n, apart) + radius
-            if above <= 1e-9 or above <= top * (math.sqrt(dot(apart, apart)) - radius - facets.radii[i]):
-                continue
-            for j in range(g * GROUP, min((g + 1) * GROUP, len(facets.faces))):
-                top = max(top, _demand(facets, i, j, top))
-                if top >= 1.0:
-                    break
+        top = _demand(facets, i, highest, 0.0)
+        for k in range(len(groups_of_groups)):
+            c = (i // GROUP**2 + k) % len(groups_of_groups)
             if top >= 1.0:
                 break
+            if not _matters(facets, i, groups_of_groups[c], top):
+                continue
+            for g in range(c * GROUP, min((c + 1) * GROUP, len(groups))):
+                if not _matters(facets, i, groups[g], top):
+                    continue
+                for j in range(g * GROUP, min((g + 1) * GROUP, len(facets.faces))):
+                    demand = _demand(facets, i, j, top)
+                    if demand > top:
+                        top, highest = demand, j
         horizon[i] = min(top, 1.0)
+
+
+@njit(**KERNEL)
+def _matters(facets, i, sphere, top):
+    """Return whether something in a sphere may demand more than `top` of facet i."""
+    apart, radius = step(triple(sphere), -1.0, triple(facets.centroids[i])), sphere[3]
+    above = dot(triple(facets.normals[i]), apart) + radius
+    return above > 1e-9 and above > top * (math.sqrt(dot(apart, apart)) - radius - facets.radii[i])
 
 
 @njit(**KERNEL)
@@ -80,13 +93,20 @@ def _demand(facets, i, j, top):
     """Return a bound on the sine of the elevation of facet j over facet i, a coarse one where it is below `top`."""
     faces, corners, normals, radii = facets.faces, facets.corners, facets.normals, facets.radii
     n, apart = triple(normals[i]), step(triple(facets.centroids[j]), -1.0, triple(facets.centroids[i]))
-    if dot(n, apart) + radii[j] <= 1e-9 or j == i:
+    highest = dot(n, apart) + radii[j]
+    if highest <= 1e-9 or j == i:
         return 0.0
+    distance = math.sqrt(dot(apart, apart))
+    gap = distance - radii[i] - radii[j]  # below 0 for facets that share a corner
+    if highest <= top * gap:
+        return top
     above = -math.inf
     for k in range(3):
         above = max(above, dot(n, step(triple(corners[j, k]), -1.0, triple(corners[i, 0]))))
     if above <= 1e-9:
         return 0.0
+    if above <= top * gap:
+        return top
     shared, sharp = 0, 1.0
     for k in range(3):
         for m in range(3):
@@ -97,9 +117,7 @@ def _demand(facets, i, j, top):
         facing = dot(n, triple(normals[j]))
         tilt = math.sqrt(max(0.0, 1.0 - facing * facing))
         return (tilt if shared == 2 else tilt / sharp) if facing > 0.0 else 1.0
-    distance = math.sqrt(dot(apart, apart))
-    gap = distance - radii[i] - radii[j]
-    if above > top * gap and distance > 0.0:  # it matters: look closer, along the centres and off each side
+    if distance > 0.0:  # it matters: look closer, along the centres and off each side
         gap = max(gap, _gap(corners, i, j, step((0.0, 0.0, 0.0), 1.0 / distance, apart)))
         for k in range(3):
             if above <= top * gap:
@@ -263,8 +281,11 @@ def horizon_of(vertices: np.ndarray, faces: np.ndarray, planes: np.ndarray) -> n
         np.minimum.at(corner_sines, faces.ravel(), sines.ravel())
         parts = faces, corners, planes[:, :3], centroids, radii, np.maximum(corner_sines, 1e-9)
         facets = Handle(Facets(*map(np.ascontiguousarray, parts)))
-        spheres = np.zeros((-(-len(faces) // GROUP), 4))
-        _groups(facets, spheres)
-        _rise(facets, obstructed, spheres, horizon)
+        groups, groups_of_groups = (np.zeros((-(-len(faces) // size), 4)) for size in (GROUP, GROUP**2))
+        _around(np.column_stack((centroids, radii)), groups)
+        _around(groups, groups_of_groups)
+        pieces = np.array_split(obstructed, -(-len(obstructed) // PIECE))
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            list(pool.map(lambda piece: _rise(facets, piece, groups, groups_of_groups, horizon), pieces))
     horizon[horizon >= 1.0] = UNKNOWN
     return horizon

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from queue import SimpleQueue
 
 from tsdf.files import need_memory
-from tsdf.grain.grains import Grain, embree_scene
+from tsdf.grain.grains import Grain
 from tsdf.grain.optics import Optics
 from tsdf.make import tally as T
 from tsdf.make.tally import Tally
@@ -21,6 +21,7 @@ from tsdf.make.tracer import Tracer, in_order
 
 PIECE = 1024  # paths that are worth a thread
 PIECES = 4  # of a round for each thread, so that one that is late holds up a quarter of its share
+ADDED_TO = 4  # threads for each that adds up what they counted
 THREAD_BYTES = 200_000_000  # of address space that a thread, its ray engine and its heap ask for, tallies apart
 
 
@@ -63,21 +64,18 @@ class Crew:
         self._sides = [[Tally(joint, memory) for _ in range(threads)] for _ in range(2)]
         first = self._sides[0][0]
         need_memory(threads * (THREAD_BYTES + 2 * sum(counts.nbytes for counts in first.arrays().values())))
-        scene = None if grain.kind == "sphere" else embree_scene(grain)  # one for all, which takes a while to make
         self._tracers = [
-            Tracer(
-                grain, optics.eta, optics.fresnel, seed, max_bounces, reflectance_scale=reflectance_scale, scene=scene
-            )
+            Tracer(grain, optics.eta, optics.fresnel, seed, max_bounces, reflectance_scale=reflectance_scale)
             for _ in range(threads)
         ]
-        # compiles what is not compiled yet, and has the ray engine make its tree before others ask it
-        self._tracers[0].trace(in_order(0, T.REPLICATES), first)
+        self._tracers[0].trace(in_order(0, T.REPLICATES), first)  # compiles what is not compiled yet
         first.clear()
         self._idle: SimpleQueue[int] = SimpleQueue()
         for worker in range(threads):
             self._idle.put(worker)
         self._stop = threading.Event()
         self._pool = ThreadPoolExecutor(threads)
+        self._adders = ThreadPoolExecutor(max(1, threads // ADDED_TO))
         self._side = 0
 
     def __enter__(self) -> "Crew":
@@ -86,6 +84,7 @@ class Crew:
     def __exit__(self, *_: object) -> None:
         self._stop.set()
         self._pool.shutdown(wait=True, cancel_futures=True)
+        self._adders.shutdown()
 
     def start(self, spans: Iterable[tuple[int, int]]) -> Round:
         """Begin a round of the paths numbered; of two rounds, one must be gathered before the next can start."""
@@ -105,10 +104,14 @@ class Crew:
     def gather(self, done: Round, total: Tally) -> tuple[list[tuple[int, int]], int]:
         """Add what a finished round counted to `total`; return which paths that were, and how many rays it took."""
         rays = sum(piece.result() for piece in done.pieces if not piece.cancelled())
-        for tally in self._sides[done.side]:
-            if tally.scalars[:, T.LAUNCHED].any():
-                total.add(tally)
-                tally.clear()
+        counted = [tally for tally in self._sides[done.side] if tally.scalars[:, T.LAUNCHED].any()]
+        sums = counted
+        while len(sums) > 1:
+            list(self._adders.map(Tally.add, sums[::2], sums[1::2]))
+            sums = sums[::2]
+        for tally in sums:
+            total.add(tally)
+        list(self._adders.map(Tally.clear, counted))
         return [span for piece, span in done.pieces.items() if not piece.cancelled()], rays
 
     def dismiss(self, rounds: Iterable[Round], patience: float) -> list[Round]:

@@ -16,6 +16,11 @@ def printable(text: str) -> str:
 
 def grain_header(grain: Grain) -> dict[str, Any]:
     """Return the header's account of a grain."""
+    return known_header(grain) | extent_header(grain)
+
+
+def known_header(grain: Grain) -> dict[str, Any]:
+    """Return what of it needs no search."""
     return {
         "kind": grain.kind,
         "name": printable(grain.name),
@@ -28,7 +33,6 @@ def grain_header(grain: Grain) -> dict[str, Any]:
         "faces": len(grain.faces),
         "mesh_sha256": grain.mesh_hash or None,
         "notes": [printable(note)[:1000] for note in grain.notes[:256]],
-        **extent_header(grain),
     }
 
 

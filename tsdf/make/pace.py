@@ -37,10 +37,10 @@ class Pace:
         return min(self.length, left) if left >= PIECE else 0
 
     def learn(self, paths: int, seconds: float) -> None:
-        """Take note of how long a round took."""
+        """Take note of how long a round took; short ones say little of longer ones, but that they may be longer."""
         self.rate = paths / max(seconds, 1e-6)
         if paths == self.length and seconds < 0.5 * ROUND_S:
-            self.length *= 2 if seconds > 0.125 * ROUND_S else 8
+            self.length = min(max(2 * self.length, int(0.75 * ROUND_S * self.rate)), 8 * self.length)
 
 
 @dataclass

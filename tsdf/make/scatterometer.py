@@ -13,6 +13,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from tsdf.make import tally as T
 from tsdf.make.crew import Crew, Round
 from tsdf.make.effort import DEFAULT_CELLS, MAX_JOINT, MAX_PATHS, Effort
 from tsdf.make.exact import exact_table
-from tsdf.make.origin import canonical_command, grain_header, printable
+from tsdf.make.origin import canonical_command, extent_header, grain_header, known_header, printable
 from tsdf.make.pace import ROUND_S, Pace, Progress
 from tsdf.make.spans import CHUNK_MIN, Spans, beginning, chunks, joined, size, without
 from tsdf.make.tally import Tally
@@ -89,6 +90,7 @@ class Build:
     done: Spans = field(default_factory=list)
     judgement: int = CHUNK_MIN
     _latest: tuple[int, statistics.TableError] | None = None
+    _sought: Future[dict[str, float]] | None = None  # of the grain's header, what takes a search
 
     @classmethod
     def start(cls, grain: Grain, optics: Optics, effort: Effort) -> "Build":
@@ -100,7 +102,17 @@ class Build:
             )
         effort = effort.resolved()
         ahead(grain)
-        return cls(grain_header(grain), optics, effort, Tally(joint=effort.joint, memory=effort.memory))
+        beside = ThreadPoolExecutor(1)
+        sought = beside.submit(extent_header, grain)
+        beside.shutdown(wait=False)
+        tally = Tally(joint=effort.joint, memory=effort.memory)
+        return cls(known_header(grain), optics, effort, tally, _sought=sought)
+
+    def _find(self) -> None:
+        """Wait for what of the grain's header is sought while the first paths are traced."""
+        if self._sought is not None:
+            self.grain = self.grain | self._sought.result()
+            self._sought = None
 
     @property
     def origin(self) -> dict[str, Any]:
@@ -128,6 +140,7 @@ class Build:
             If they cannot answer this request; the message says what they can.
         """
         mine, other = self.origin, stored.origin
+        other["grain"] = {key: other["grain"].get(key) for key in mine["grain"]}
         differing = [key.replace("_", "-") for key in mine if mine[key] != other[key]]
         for kind in ("joint", "memory"):
             if getattr(self.effort, kind) > getattr(stored.tally, kind):
@@ -169,6 +182,7 @@ class Build:
         errors = statistics.TableErrors(self.tally, self.effort.cells)
         progress.error = errors.fewest(target) or errors.rough()
         if progress.error.total_variation <= target:
+            self._latest = paths, progress.error
             progress.total = self.judgement = paths
             return True
         least, needed = (times * paths for times in errors.needed(target))
@@ -282,7 +296,8 @@ class Build:
                     reflectance_scale)  # fmt: skip
         tracing.set()
         under_way: deque[Round] = deque()
-        pace, ahead, before, saved = Pace(deadline), self.done, time.monotonic(), -math.inf
+        pace, ahead, before = Pace(deadline, CHUNK_MIN * max(1, threads // 2)), self.done, time.monotonic()
+        saved = before
         with crew:
             while True:
                 while len(under_way) < 2 and not leave.is_set():
@@ -407,6 +422,7 @@ class Build:
             "paths": paths,
             "max_bounces": made.max_bounces,
         }
+        self._find()
         tally = self.tally.narrowed(made.joint, made.memory)
         return assemble.traced_table(tally, error.cells, self.grain, self.optics, provenance, made.memory)
 
@@ -418,6 +434,7 @@ class Build:
         TSDFError
             If it cannot be written; the file that stood there is left as it was.
         """
+        self._find()
         request = json.dumps({**self.origin, "effort": asdict(self.effort), "judgement": self.judgement})
         kept: dict[str, np.ndarray] = {
             archive.PART: np.frombuffer(request.encode(), dtype=np.uint8),

@@ -18,6 +18,7 @@ from tsdf.make.tally import Tally
 LEGENDRE = 16  # highest Legendre moment in the header
 MIN_CELLS, MAX_CELLS = 8, T.COARSE
 HAZE = 0.3  # share of the noise that a cell width may be too large by
+FEW = 4  # numbers that are summed one by one
 NEAR = 1.3  # errors an octave of cells beside the least are no larger than so many times it
 STATISTICS = (
     "hit_probability",
@@ -162,12 +163,13 @@ class TableErrors:
 
     def _estimate(self, cells: int) -> TableError:
         theta, replicates = self._theta, len(self._theta)
-        noise = columns_of(theta, cells).std(axis=0, ddof=1).sum()
+        columns = columns_of(theta, cells)
+        noise = columns.std(axis=0, ddof=1).sum()
         widths: list[float] = []
         for parts in (2, 4, 8, 16):
             if parts * cells > T.FINE:
                 break
-            width, blur = _width(theta[:, : T.FINE], cells, parts)
+            width, blur = _width(theta[:, : T.FINE], columns[:, -2:0:-1], parts)
             if widths and blur > 1.5 * width:
                 break
             widths.append(width)
@@ -227,15 +229,22 @@ class TableErrors:
         return least, math.sqrt(least * most) if math.isfinite(most) else least
 
 
-def _width(theta: np.ndarray, cells: int, parts: int) -> tuple[float, float]:
-    """Return the total variation between the columns and their `parts` nearly equal parts, and the parts' noise."""
-    replicates = len(theta)
+def _width(theta: np.ndarray, sums: np.ndarray, parts: int) -> tuple[float, float]:
+    """Return the total variation between columns and their `parts` nearly equal parts, and the parts' noise.
+
+    Parameters
+    ----------
+    theta : (replicates, FINE) float64
+    sums : (replicates, cells) float64
+        Of `theta` over each column.
+    """
+    replicates, cells = sums.shape
     edges = bounds(cells, T.FINE)
     cuts = np.append(np.rint(np.linspace(edges[:-1], edges[1:], parts, endpoint=False)).astype(int).T.ravel(), T.FINE)
-    deviations = np.add.reduceat(theta, cuts[:-1], axis=1).reshape(replicates, cells, parts)
+    deviations = _between(theta, cuts).reshape(replicates, cells, parts)
     share = np.diff(-np.cos(cuts * (math.pi / T.FINE))).reshape(cells, parts)
     share /= share.sum(axis=1, keepdims=True)  # the density of the table is uniform in cos theta within a column
-    deviations -= np.add.reduceat(theta, edges[:-1], axis=1)[:, :, None] * share
+    deviations -= sums[:, :, None] * share
     mean = deviations.mean(axis=0)
     deviations -= mean
     variances = np.square(deviations, out=deviations).sum(axis=0) / ((replicates - 1) * replicates)
@@ -248,6 +257,20 @@ def _width(theta: np.ndarray, cells: int, parts: int) -> tuple[float, float]:
     clear = squares.sum(axis=1) > 3.0 * math.sqrt(2.0 / parts) * variances.sum(axis=1)
     width = 0.5 * np.where(clear, alone, np.minimum(alone, together)).sum()
     return float(width), float(np.sqrt(variances).sum() * math.sqrt(0.5 / math.pi))
+
+
+def _between(values: np.ndarray, cuts: np.ndarray) -> np.ndarray:
+    """Return the sums of (n, m) values from each cut to the next, to the last bit those of ``np.add.reduceat``, which
+    takes several times as long where there are few between cuts."""
+    size = int(cuts[1] - cuts[0])
+    if size > FEW or (np.diff(cuts) != size).any():
+        return np.add.reduceat(values, cuts[:-1], axis=1)
+    if size == 1:
+        return values.copy()
+    rest = values[:, 1::size]  # all but the first, which is added last
+    for k in range(2, size):
+        rest = rest + values[:, k::size]
+    return values[:, ::size] + rest
 
 
 def _pooled(values: np.ndarray, window: int) -> np.ndarray:

@@ -301,21 +301,22 @@ def in_order(first: int, last: int) -> np.ndarray:
     return numbers[np.argsort(numbers % T.REPLICATES, kind="stable")]
 
 
-def surface_of(grain: Grain, plain: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return what the kernels ask of a grain's surface; of the exact sphere, one facet that says nothing.
+class Surface(NamedTuple):
+    """What tracing asks of a grain's surface; of the exact sphere, one facet that says nothing, and no ray engine.
 
-    It is found once for all threads that ask, for the horizon may take a second.
-
-    Returns
-    -------
-    planes : (n, 4) float64
-        Normal and height over the origin of each facet.
-    centroids : (n, 3) float64
-    horizon : (n,) float64
-        See `horizon_of`; nothing is promised if `plain`.
-    share : float
-        Share of the light that comes in above the horizon.
+    planes (n, 4): normal and height over the origin of each facet; centroids (n, 3); horizon (n,): see `horizon_of`,
+    nothing is promised of a plain one; share: of the light, what comes in above the horizon; scene: the ray engine's.
     """
+
+    planes: np.ndarray
+    centroids: np.ndarray
+    horizon: np.ndarray
+    share: float
+    scene: Any
+
+
+def surface_of(grain: Grain, plain: bool) -> Surface:
+    """Return the surface of a grain, found once for all threads that ask, for the horizon may take a second."""
     with _finding:
         return _surface_of(grain, plain)
 
@@ -324,9 +325,9 @@ _finding = Lock()
 
 
 @lru_cache(maxsize=2)
-def _surface_of(grain: Grain, plain: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def _surface_of(grain: Grain, plain: bool) -> Surface:
     if grain.kind == "sphere":
-        return np.zeros((1, 4)), np.zeros((1, 3)), np.zeros(1), 1.0
+        return Surface(np.zeros((1, 4)), np.zeros((1, 3)), np.zeros(1), 1.0, None)
     corners = grain.vertices[grain.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     double_areas = np.linalg.norm(normals, axis=1)
@@ -335,12 +336,12 @@ def _surface_of(grain: Grain, plain: bool) -> tuple[np.ndarray, np.ndarray, np.n
     planes = np.column_stack((normals, np.einsum("ij,ij->i", normals, centroids)))
     horizon = np.full(len(planes), UNKNOWN) if plain else horizon_of(grain.vertices, grain.faces, planes)
     share = float(np.average(np.maximum(1.0 - horizon**2, 0.0), weights=double_areas))
-    return planes, centroids, horizon, share
+    return Surface(planes, centroids, horizon, share, embree_scene(grain))
 
 
 @dataclass(eq=False)
 class Tracer:
-    """One thread's way of tracing a grain: the ray engine, the state of its rays and nothing else.
+    """One thread's way of tracing a grain: the state of its rays, and what all share: surface and ray engine.
 
     Parameters
     ----------
@@ -356,8 +357,6 @@ class Tracer:
         Independent random numbers and one way at each hit: the textbook estimator, for comparison.
     reflectance_scale : float
         Factor on every partial reflectance; other than 1 it makes a wrong tracer, to test the tests.
-    scene : EmbreeScene, optional
-        Of the grain, to share; one of its own by default. Whoever uses it first must have done so before another asks.
     """
 
     grain: Grain
@@ -368,14 +367,11 @@ class Tracer:
     plain: bool = False
     reflectance_scale: float = 1.0
     slots: int = SLOTS
-    scene: Any = None
     log: Callable[[np.ndarray, np.ndarray], None] | None = None
 
     def __post_init__(self) -> None:
-        planes, centroids, horizon, share = surface_of(self.grain, self.plain)
+        planes, centroids, horizon, share, self._scene = surface_of(self.grain, self.plain)
         self._sphere = self.grain.kind == "sphere"
-        if not self._sphere:
-            self._scene = self.scene or embree_scene(self.grain)
         self._fan = 1 if self.plain else FAN if share > OPEN else FAN // 2
         self._task = Handle(
             Task(

@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,6 +33,10 @@ MAX_NUMBERS = 2**25  # of an environment out of a small file: four channels of 4
 SMALL = 10_000_000  # [B] files that must be read within a gigabyte of memory
 DENSEST = 8  # numbers for each byte of a larger file: 8192 x 4096 pixels fit well into 13 MB of lossy compression
 STDERR = 2  # its file descriptor
+OBSERVER = "observer.csv"  # in tsdf.reference_data: the CIE 1931 2-degree observer and D65
+XYZ_TO_RGB = np.array(  # IEC 61966-2-1
+    [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
+)
 LARGEST_HALF = 65504.0  # beyond which 16-bit floats are infinite
 OTHERS = {b"#?": "Radiance HDR", b"\x89PNG": "PNG", b"\xff\xd8\xff": "JPEG", b"II*\0": "TIFF", b"MM\0*": "TIFF"}
 
@@ -407,14 +412,10 @@ def spectral_weights(wavelengths: tuple[float, ...] | None = None) -> Spectrum:
         or not (np.isfinite(nodes).all() and nodes[0] > 0 and (np.diff(nodes) > 0).all())
     ):
         raise UsageError("wavelengths must be finite, ascending and more than 0 nm")
-    colour = _colour()
-    nm = np.arange(380.0, 781.0)
-    observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
-    d65 = colour.SDS_ILLUMINANTS["D65"]
-    light = np.interp(nm, d65.wavelengths, d65.values)  # CIE 15:2018 interpolates D65 linearly
+    with (resources.files("tsdf.reference_data") / OBSERVER).open(encoding="ascii") as file:
+        nm, x, y, z, light = np.loadtxt(file, delimiter=",", skiprows=2, unpack=True)
     light[[0, -1]] *= 0.5  # the trapezoidal rule
-    xyz = light[:, None] * np.stack([np.interp(nm, observer.wavelengths, v) for v in observer.values.T], axis=1)
-    rgb = xyz @ colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB.T
+    rgb = (light[:, None] * np.stack([x, y, z], axis=1)) @ XYZ_TO_RGB.T
     distance = np.abs(nm - nodes[:, None])
     nearest = distance == distance.min(axis=0)
     weight = (nearest / nearest.sum(axis=0)) @ (rgb / rgb.sum(axis=0))  # a step halfway counts half to each

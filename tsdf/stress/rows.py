@@ -73,9 +73,9 @@ def chosen(names: str | None, setting: Setting) -> list[Row]:
     if names is None:
         return [row for row in there.values() if row.quick or not setting.quick]
     found = []
-    for name in (part.strip() for part in names.split(",")):
+    for name in dict.fromkeys(part.strip() for part in names.split(",")):
         if name not in there:
-            near = get_close_matches(name, there, 1)
+            near = get_close_matches(name.lower(), there, 1)
             hint = f"did you mean {near[0]}?" if near else "see tsdf-stress --help, which lists them"
             if any(row.name == name for row in ROWS):
                 hint = "it is about one table: name it"
