@@ -71,10 +71,11 @@ def _first(plan: Plan) -> str:
         met = f"{percent(p.floor.value)} of it is not noise"
     elif plan.seconds is not None and plan.able is not None:
         after = f"an error of {percent(p.error(plan.able))} after {span(plan.seconds)}"
-        met = f"none is sure to meet {percent(plan.target)} in that time, and this one has least"
-        able = plan.able
+        met, able = f"none is sure to meet {percent(plan.target)} in that time, and ", plan.able
         if min(one.likely_error(able) for one in plan.predictions) * TIE < p.likely_error(able):
-            met += " of those that aim at lights"
+            met += "single grains, which meet suns by chance, would be mostly noise, so their glints are left out"
+        else:
+            met += "this one has least"
         if takes <= plan.able:
             met = f"{percent(plan.target)} after {_about(takes)}"
     elif math.isinf(takes):
