@@ -291,8 +291,13 @@ def test_nobody_waits_for_days(far: Plan, ball: tsdf.Table, monkeypatch: pytest.
     scene = replace(far.scene, render=Render("auto"))
     monkeypatch.setattr(shot, "TARGET", 0.002)
     choice = shot.chosen(scene, threads=2)
-    assert (choice.spp, choice.seconds, choice.target_error) == (None, 0.5, None)
-    assert choice.plan is not None and "after 0.5 s (none is sure to meet 0.2 %" in choice.plan.why[0]
+    assert choice.plan is not None
+    assert (choice.spp, choice.seconds, choice.target_error) == (None, 0.5, choice.plan.noise)
+    chosen = choice.plan.chosen
+    chosen = replace(chosen, floor=chosen.floor._replace(value=0.5))
+    hopeless = replace(choice.plan, predictions=(chosen, *choice.plan.predictions[1:]))
+    assert hopeless.noise == 0.5 * 0.002  # beside what is missed, less noise would not show
+    assert "after 0.5 s (none is sure to meet 0.2 %" in choice.plan.why[0]
     asked = shot.chosen(scene, target_error=0.002, threads=2)
     assert asked.seconds is None and asked.target_error == 0.002
     assert asked.plan is not None and asked.plan.seconds is None

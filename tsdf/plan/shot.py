@@ -40,7 +40,8 @@ def chosen(
     """Return a scene at a level, and when its picture is done; planned where the level is "auto".
 
     A stop that is given is obeyed, and the choice is for it; else the scene's samples per pixel are taken, and where it
-    says none, `SPP`, or of a plan, as many as make its error `TARGET`, but no more than take `planner.PATIENCE`.
+    says none, `SPP`, or of a plan, as many as make its error `TARGET`, or where that is out of reach its noise half of
+    that, but no more than take `planner.PATIENCE`.
     """
     level = level or scene.render.level
     if spp is None and seconds is None and target_error is None:
@@ -51,7 +52,7 @@ def chosen(
     limit = math.inf if target_error is not None else seconds
     made = plan(scene, min(target, 0.99), limit, spp, seed, threads, told)
     if spp is None and seconds is None and target_error is None:
-        target_error, seconds = (made.noise, None) if made.seconds is None else (None, made.seconds)
+        target_error, seconds = made.noise, made.seconds
     return Choice(made.planned, spp, seconds, target_error, made)
 
 
