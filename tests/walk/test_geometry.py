@@ -15,7 +15,19 @@ from tsdf.grain.optics import Optics
 from tsdf.make import scatterometer
 from tsdf.make.scatterometer import Effort
 from tsdf.picture import render, world
-from tsdf.scene.scene import Box, Camera, ConstantLight, GrainSpec, MediumSpec, Mesh, Scene, Slab, Sphere, SurfaceSpec
+from tsdf.scene.scene import (
+    Absorption,
+    Box,
+    Camera,
+    ConstantLight,
+    GrainSpec,
+    MediumSpec,
+    Mesh,
+    Scene,
+    Slab,
+    Sphere,
+    SurfaceSpec,
+)
 from tsdf.walk import geometry
 from tsdf.walk.geometry import clearance, exact_hit, unmet
 from tsdf.walk.grid import cells_of
@@ -305,3 +317,41 @@ def test_what_slips_through_a_mesh_is_not_in_it(table, tmp_path):
     slipped = render.render(replace(made, place=place, brim=place, media=limited), spp=4)
     assert whole.events > 4000 and (whole.rgb == 1.0).all()
     assert slipped.events == 0 and slipped.truncated == 0 and (slipped.rgb == 1.0).all()
+
+
+def boxes(tmp_path, *extents):
+    """Return meshes of boxes, low and high corners each."""
+    paths = []
+    for number, (low, high) in enumerate(extents):
+        mesh = geometry.box_mesh(low, high)
+        paths.append(tmp_path / f"{number}.ply")
+        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(paths[-1])
+    return [Mesh(path) for path in paths]
+
+
+def test_media_that_touch_keep_to_themselves(table, tmp_path):
+    """A dark one beside a lossless one, whose extent is a whole number of the grid's cells, or nearly: facets at one
+    place are both met. Half of the light of one was scattered in the other."""
+    shapes = boxes(tmp_path, ((-1.0, -1.0, -1.0), (0.0, 1.0, 1.0)), ((0.0, -1.0, -1.0), (1.0, 1.0, 1.0)))
+    camera = Camera((6.0, 0.1, 0.1), (0.0, 0.0, 0.0), 12, 12, fov_deg=15.0)
+    means = []
+    for radius in (0.05, 0.0501):
+        media = tuple(
+            MediumSpec(shape, 0.5, radius, (GrainSpec(table, absorption=Absorption("grey", (dark,))),), name=f"{dark}")
+            for shape, dark in zip(shapes, (100.0, 0.0), strict=True)
+        )
+        made = world.build(Scene(camera, (ConstantLight((1.0, 1.0, 1.0)),), media, name="two"), "volume", leap=0.0)
+        assert made.place.arrays.grid.margin > 0.0
+        means.append(float(render.render(made, spp=64).rgb.mean()))
+    assert means[0] < 0.95 and abs(means[0] - means[1]) < 0.03  # standard errors of .005; it was .08
+
+
+def test_media_that_overlap_a_little_are_all_there(table, tmp_path):
+    """By less than is refused, where the grid has a mark: the second is there beyond it."""
+    shapes = boxes(tmp_path, ((-1.0, -0.5, -0.5), (0.0054, 0.5, 0.5)), ((0.0049, -0.5, -0.5), (1.0, 0.5, 0.5)))
+    media = tuple(MediumSpec(shape, 0.5, 0.01, (GrainSpec(table),), name=f"{n}") for n, shape in enumerate(shapes))
+    surface = SurfaceSpec(Box((0.3, -0.1, -0.1), (0.5, 0.1, 0.1)), (0.5, 0.5, 0.5))
+    camera = Camera((0.8, 0.0, 0.0), (0.4, 0.0, 0.0), 4, 4, fov_deg=10.0)
+    made = world.build(Scene(camera, (ConstantLight((1.0, 1.0, 1.0)),), media, (surface,), name="o"), "volume")
+    picture = render.render(made, spp=4)
+    assert picture.events > 20 * picture.samples.sum()

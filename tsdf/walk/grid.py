@@ -331,23 +331,28 @@ def home_of(grid, sums, p):
 @njit(**KERNEL)
 def find_homes(grid, home, sums):
     """Write the medium of each cell's mark to `home` (x y z,): NONE at the grid's walls, and then as facets are
-    crossed along x; `sums` (meshes,) is used. UNKNOWN where rounding could matter."""
+    crossed along x; `sums` (meshes,) is used. UNKNOWN where rounding could matter, and where there are several."""
     nx, ny, nz = grid.free.shape
     way = (1.0, 0.0, 0.0)
     for j in range(ny):
         for k in range(nz):
             now, before = NONE, mark(grid, 0, j, k)
             line = line_of(before, way)
+            for e in range(sums.shape[0]):
+                sums[e] = 0
             for i in range(nx):
                 cell, here = (i * ny + j) * nz + k, mark(grid, i, j, k)
                 last = ((i - 1) * ny + j) * nz + k if i > 0 else cell
                 if grid.cells[cell] >= 0 or grid.cells[last] >= 0:
                     wall = (grid.low[0] + i * grid.edge, here[1], here[2])
-                    for e in range(sums.shape[0]):
-                        sums[e] = 0
                     crossings(grid, sums, last, line, before, wall)
                     crossings(grid, sums, cell, line, wall, here)
-                    now = entered(grid, sums, now)
+                    now, holders = NONE, 0
+                    for e in range(sums.shape[0]):
+                        if grid.owner[e] != NONE and sums[e] > 0:
+                            now, holders = grid.owner[e], holders + 1
+                    if holders > 1:
+                        now = UNKNOWN
                 home[cell], before = now, here
             if now != NONE:  # these are no closed meshes
                 for i in range(nx):
@@ -398,8 +403,10 @@ def grid_of(meshes: Sequence[np.ndarray], owner: np.ndarray, planes: np.ndarray,
     counts = np.ceil(size / edge).astype(int) + 2
     low = 0.5 * (low + high) - 0.5 * counts * edge
     free, first, listed = cells_of(corners, planes, low, edge, counts)
-    outer = ((corners < low + edge) | (corners > low + (counts - 1) * edge)).any(axis=(1, 2))
-    margin = 2.0 * GRAZING * float(thickness[~outer].max(initial=0.0))
+    hair = 1e-6 * edge  # what the box holds is no outer for rounding
+    outer = ((corners < low + edge - hair) | (corners > low + (counts - 1) * edge + hair)).any(axis=(1, 2))
+    held = ((corners >= low) & (corners <= low + counts * edge)).all(axis=(1, 2))
+    margin = 2.0 * GRAZING * float(thickness[held].max(initial=0.0))
     few = int(outer.sum()) <= OUTSIDE
     home = np.full(free.size if (owner != NONE).any() else 0, NONE, np.int16)
     occupied = np.flatnonzero(first[1:] > first[:-1])
