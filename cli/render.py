@@ -135,6 +135,9 @@ def main(
         click.echo(f"warning: {picture.trust.doubt}", err=True)
     if not quiet or picture.interrupted:
         summary(made, picture, out)
+        if choice.plan is not None and choice.plan.chosen.floor.value > picture.relative_error:
+            say(f"{plain(out)}: that is noise; beside it the level misses about "
+                f"{report.percent(choice.plan.chosen.floor.value)}")  # fmt: skip
     return interrupt_status() if picture.interrupted else 0
 
 

@@ -300,4 +300,6 @@ class _Kept:
             return caching.NullCache()
 
     def __getattr__(self, name: str) -> Any:
+        if name in ("_function", "_made"):  # of a copy that is not whole yet
+            raise AttributeError(name)
         return getattr(self._made, name)

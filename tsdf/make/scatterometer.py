@@ -140,7 +140,9 @@ class Build:
             If they cannot answer this request; the message says what they can.
         """
         mine, other = self.origin, stored.origin
-        other["grain"] = {key: other["grain"].get(key) for key in mine["grain"]}
+        both = mine["grain"].keys() & other["grain"].keys()  # what is sought of one may be found of the other already
+        for origin in (mine, other):
+            origin["grain"] = {key: origin["grain"][key] for key in both}
         differing = [key.replace("_", "-") for key in mine if mine[key] != other[key]]
         for kind in ("joint", "memory"):
             if getattr(self.effort, kind) > getattr(stored.tally, kind):

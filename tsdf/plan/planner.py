@@ -7,7 +7,7 @@ What is expected of a scene is `prior`, what short renders of it show is `pilot`
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from tsdf.data import format as tsdf_format
@@ -19,7 +19,7 @@ from tsdf.plan import needs, prior
 from tsdf.plan.evidence import BOLD, BOLD_BIAS, GRAINS, MEETINGS, Evidence, singly
 from tsdf.plan.pilot import FEWEST, HALVES, PIXELS, Pilot
 from tsdf.plan.prediction import TIE, Plan, Prediction
-from tsdf.plan.report import digits, why
+from tsdf.plan.report import BUSY, digits, why
 from tsdf.scene.levels import LEVELS
 from tsdf.scene.medium import Component, free_path
 from tsdf.scene.scene import Scene
@@ -50,7 +50,6 @@ ENOUGH = 4.0  # times `MEETINGS` that they are to be met in the time that the re
 NEAR = 3.0  # times as long as the best as a candidate may seem to take to be looked at again
 EVENT_S = (1.0e-6, 5.0e-6)  # [s] of one explicit grain, an exact sphere and one of facets, about
 PATIENCE = 600.0  # [s] that a picture may take where nothing is said
-BUSY = 1.5  # times as long as on processors that have nothing else to do, from which on it is said
 FEWER = 1.3  # times as large as they look in the middle, grains must look somewhere for their number to go by pixel
 
 
@@ -163,9 +162,19 @@ class _Planning(Evidence):
         made = Plan(
             self.asked, self.target, self.limit if self.said or beyond else None, (chosen, *rest), far, (),
             tuple(lacking), tuple(self.notes), self.spent, time.perf_counter() - self.began, self.threads, self.load,
-            self.spp,
+            self.spp, beyond and self.drowned(chosen, rest),
         )  # fmt: skip
         return replace(made, why=why(made, self.bodies, self.footprint, self.coverage, str(self.reference)))
+
+    def drowned(self, chosen: Prediction, others: Sequence[Prediction]) -> bool:
+        """Return whether single grains have less error than the chosen, but such that are left out as mostly noise."""
+        limit = self.limit / self.load
+        return self.rarer > 1.0 and any(
+            singly(p.candidate)
+            and p.noise(limit) > UNFINISHED
+            and TIE * p.likely_error(limit) < chosen.likely_error(limit)
+            for p in others
+        )
 
     def settled(self) -> tuple[Prediction, list[Prediction]]:
         """Return what is chosen, which a pilot has seen where one can, and all predictions."""

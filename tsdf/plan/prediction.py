@@ -96,6 +96,8 @@ class Plan:
         How many times as long things take now as they would if processors had nothing else to do.
     spp : int or None
         Samples per pixel that the picture has, where it is done then.
+    glints : bool
+        Whether single grains would have less error but are left out, for most of it would be the noise of their glints.
     """
 
     scene: Scene
@@ -111,6 +113,7 @@ class Plan:
     threads: int
     load: float = 1.0
     spp: int | None = None
+    glints: bool = False
 
     @property
     def chosen(self) -> Prediction:

@@ -10,6 +10,7 @@ from tsdf.plan.prediction import TIE, Plan, Prediction
 from tsdf.plan.prior import Body
 
 TARGETS = np.geomspace(0.002, 0.5, 120)  # [1] that are tried for what would change a plan's mind
+BUSY = 1.5  # times as long as on processors that have nothing else to do, from which on it is said
 OTHER = 1.2  # times as high or low as its target, from which on another target is another wish
 
 
@@ -71,11 +72,11 @@ def _first(plan: Plan) -> str:
         met = f"{percent(p.floor.value)} of it is not noise"
     elif plan.seconds is not None and plan.able is not None:
         after = f"an error of {percent(p.error(plan.able))} after {span(plan.seconds)}"
-        met, able = f"none is sure to meet {percent(plan.target)} in that time, and ", plan.able
-        if min(one.likely_error(able) for one in plan.predictions) * TIE < p.likely_error(able):
+        met = f"none is sure to meet {percent(plan.target)} in that time, and "
+        if plan.glints:
             met += "single grains, which meet suns by chance, would be mostly noise, so their glints are left out"
         else:
-            met += "this one has least"
+            met += "none that was looked at is likely to have a tenth less"
         if takes <= plan.able:
             met = f"{percent(plan.target)} after {_about(takes)}"
     elif math.isinf(takes):
@@ -88,13 +89,24 @@ def _first(plan: Plan) -> str:
     return f"take {p.candidate}{far}: {after} ({met})"
 
 
+def to_noise(plan: Plan, noise: float) -> str:
+    """Return the first line of a plan for a picture that is done at a noise of its pixels, whatever it misses."""
+    p = plan.chosen
+    if not 0.0 < p.variance < math.inf:
+        return _first(plan)
+    after = _about(p.variance * p.turn / noise**2)
+    missed = f"beside which it misses {percent(p.floor.value)}" if p.floor.high else "and nothing else is wrong"
+    return f"take {p.candidate}: noise of {percent(noise)} after {after}, {missed}"
+
+
 def _reason(plan: Plan, bodies: Sequence[Body], footprint: float, coverage: float, reference: str) -> str:
     chosen = plan.chosen
     if not bodies:
         return "because there are no grains in the scene, and all levels are the same"
     body = max(bodies, key=lambda one: one.thickness)
     seen = f"a pixel covers {footprint:.2g} R of grains" if math.isfinite(footprint) else "it sees no grains,"
-    thick = f"{digits(body.thickness)} R or {digits(body.thickness / body.transport)} transport lengths"
+    many = digits(body.thickness / body.transport)
+    thick = f"{digits(body.thickness)} R or {many} transport length{'s' * (many != '1')}"
     which = f" in the thickest of {len(bodies)} media" if len(bodies) > 1 else ""
     where = f"{seen} that fill {100.0 * body.packing_fraction:.3g} % of {thick}{which}"
     turn = chosen.variance * chosen.turn
@@ -150,8 +162,9 @@ def _short_of_time(plan: Plan, able: float) -> str:
 def table(plan: Plan) -> list[str]:
     """Return a table of all candidates as lines of text."""
     after = plan.able
-    head = ["candidate", "bias %", "texture %", "error at best %", f"time to {percent(plan.target)}"]
-    head += [f"error after {span(plan.seconds)}"] if plan.seconds is not None else []
+    free, now = ("", "") if plan.load < BUSY else (", free", ", busy")  # processors
+    head = ["candidate", "bias %", "texture %", "error at best %", f"time to {percent(plan.target)}{free}"]
+    head += [f"error after {span(plan.seconds)}{now}"] if plan.seconds is not None else []
     rows = [[*head, "by"]]
     for p in plan.predictions:
         row = [

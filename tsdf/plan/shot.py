@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from tsdf.picture import render as pictures
 from tsdf.picture.render import Picture
 from tsdf.picture.world import build
+from tsdf.plan import report
 from tsdf.plan.planner import TARGET, plan
 from tsdf.plan.prediction import Plan
 from tsdf.scene.levels import AUTO
@@ -51,6 +52,8 @@ def chosen(
     target = TARGET if target_error is None else BOTH * target_error
     limit = math.inf if target_error is not None else seconds
     made = plan(scene, min(target, 0.99), limit, spp, seed, threads, told)
+    if target_error is not None:
+        made = replace(made, why=(report.to_noise(made, target_error), *made.why[1:]))
     if spp is None and seconds is None and target_error is None:
         target_error, seconds = made.noise, made.seconds
     return Choice(made.planned, spp, seconds, target_error, made)

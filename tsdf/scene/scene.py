@@ -187,7 +187,7 @@ def absorbing_material(name: str, folder: str | os.PathLike[str] = ".") -> str |
     if name in ABSORBING:
         return name
     if name in MEDIA or not (Path(name).suffix or path.exists()):
-        named = f"it is one of {', '.join(ABSORBING)}" if name in MEDIA else hint(name, ABSORBING)
+        named = f"its k is not known, those of {', '.join(ABSORBING)} are" if name in MEDIA else hint(name, ABSORBING)
         raise UsageError(
             f"no absorbing material {shown(name)}; {named} (or a file of your own constants, .csv of "
             "wavelength_nm,n,k or .yml of refractiveindex.info)"

@@ -137,8 +137,10 @@ def places(count: int, pairs: Sequence[Pair]) -> list[tuple[int, int]]:
 
 
 def best(values: np.ndarray) -> tuple[int, list[int]]:
-    """Return the candidate with the smallest mean of values (candidates, runs), and those that may be as good: all that
-    it is not told apart from when all pairs are ranked, for which is the smallest is known from the same runs."""
-    first = int(values.mean(axis=1).argmin())
+    """Return the candidate with the smallest mean of values (candidates, runs), each one standard error high so that
+    what is little known does not win by luck, and those that may be as good: all that it is not told apart from when
+    all pairs are ranked, for which is the smallest is known from the same runs."""
+    errors = values.std(axis=1, ddof=1) / math.sqrt(values.shape[1]) if values.shape[1] > 1 else 0.0
+    first = int((values.mean(axis=1) + errors).argmin())
     told = {pair.worse for pair in ranked(values) if pair.resolved and pair.better == first}
     return first, [k for k in range(len(values)) if k != first and k not in told]

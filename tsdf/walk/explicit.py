@@ -276,11 +276,13 @@ def sides_of(grain: Grain, planes: np.ndarray) -> list[int]:
         Normal and height over the origin of its facets.
     """
     found: list[int] = []
-    for facet, plane in enumerate(planes):
-        if all(np.abs(planes[other] - plane).max() > FLAT for other in found):
-            if len(found) == MOST_SIDES or (grain.vertices @ plane[:3]).max() > plane[3] + FLAT:
-                return []
-            found.append(facet)
+    left = np.arange(len(planes))
+    while len(left):
+        plane = planes[left[0]]
+        if len(found) == MOST_SIDES or (grain.vertices @ plane[:3]).max() > plane[3] + FLAT:
+            return []
+        found.append(int(left[0]))
+        left = left[np.abs(planes[left] - plane).max(axis=1) > FLAT]
     return found
 
 

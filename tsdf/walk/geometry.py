@@ -1,9 +1,10 @@
 """Where things are in a scene: boundaries of media, opaque surfaces, what a ray meets and how far the nearest is.
 
 Media have a boundary each: a closed mesh, in a ray-engine scene of its own, or a slab, box or sphere, found exactly.
-Opaque surfaces are triangles, all in one more ray-engine scene, and exact balls. Which medium a ray is in is never
-remembered: the first facet of a medium's own boundary that the ray meets says on which side the ray runs, so that
-boundaries that touch, coincide with a surface or hold the camera need no care. Embree names the facet; the distance
+Opaque surfaces are triangles, all in one more ray-engine scene, and exact balls. Which medium a ray is in is not
+remembered across boundaries: the first facet of a medium's own boundary that the ray meets says on which side the ray
+runs, or the grid (`grid.home_of`) in which mesh it has come, so that boundaries that touch, coincide with a surface or
+hold the camera need no care. Embree names the facet; the distance
 comes from the facet's plane in float64. What light does there is `transport`.
 """
 

@@ -13,6 +13,7 @@ from tsdf.sampling import mix, unit
 from tsdf.scene.levels import Traits
 from tsdf.vectors import KERNEL
 from tsdf.walk.geometry import NONE
+from tsdf.walk.grid import UNKNOWN as UNKNOWN  # medium of a walker that may have crossed a boundary
 
 WALKER = np.dtype(
     [("p", "3f8"), ("d", "3f8"), ("q", "3f8"), ("e", "3f8"), ("t", "3f8"), ("colour", "3f8"), ("weight", "f8"),
@@ -28,7 +29,6 @@ WALKER = np.dtype(
 # the bounding sphere at the end of the free path, the side on which it is entered and the impact parameter [R]. single:
 # grains met one by one so far.
 FLY, JUMP, GRAIN = 0, 1, 2
-UNKNOWN = -2  # medium of a walker that may have crossed a boundary
 
 EVENTS, RAYS, TRUNCATED, FAULTS, LEAPT, LEAPS = range(6)  # counters; LEAPT of the events, in so many LEAPS
 LIVE, MOST, ASKED, GRAINS_ASKED = range(4)  # of `Batch.asked`
