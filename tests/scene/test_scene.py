@@ -365,7 +365,7 @@ BROKEN = [  # (path, value, what the line says after the name of the scene)
     ("medium/0/grain/0/absorption", [1, 2], GRAIN + ": absorption must be a list of 3 numbers, not [1, 2]"),
     ("medium/0/grain/0/absorption", "ice", GRAIN + ": absorption must be numbers or a table, not 'ice'; of a material"),
     ("medium/0/grain/0/absorption", {"material": "ise"}, "material: no absorbing material 'ise'; did you mean 'ice'?"),
-    ("medium/0/grain/0/absorption", {"material": "salt"}, "material 'salt'; its k is not known, those of ice, water, glass are (or"),
+    ("medium/0/grain/0/absorption", {"material": "salt"}, "material 'salt'; its k is not known, those of ice, "),
     ("medium/0/grain/0/absorption", {"material": "ice", "x": 1}, "absorption: unknown key 'x'; it is one of material"),
     ("medium/0/grain/0/absorption", {"material": "ice"}, "metres_per_unit is missing: absorption of a material"),
     ("medium/0/grain/0/absorption", {}, "absorption: 'wavelength_nm' is missing"),

@@ -427,7 +427,7 @@ class _Planning(Evidence):
                 p for p in found if not (chance and singly(p.candidate) and p.noise(limit) > UNFINISHED)
             ] or found  # fmt: skip
             least = min(p.likely_error(limit) for p in aimed)
-            alike = [p for p in aimed if p.likely_error(limit) <= TIE * least]
+            alike = [p for p in aimed if p.likely_error(limit) <= TIE * least] or aimed  # of pilots without light
             return min(alike, key=lambda p: math.hypot(p.bias, p.bias_error, p.noise(limit)))
         if math.isinf(takes):
             return min(found, key=lambda p: p.floor.high)

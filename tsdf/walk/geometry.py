@@ -23,7 +23,7 @@ from tsdf.grain.meshes import read_mesh
 from tsdf.scene.keys import FARTHEST
 from tsdf.scene.scene import SMALLEST, Box, MediumSpec, Mesh, Rectangle, Scene, Slab, Sphere, SurfaceSpec, called
 from tsdf.vectors import KERNEL, dot, step
-from tsdf.walk.grid import GRAZING, NONE, UNKNOWN, Grid, free_around, grid_of, home_of, march
+from tsdf.walk.grid import GRAZING, NONE, Grid, free_around, grid_of, march
 from tsdf.walk.room import BALL, BOX, CLOSED, MESH, OPEN, SLAB, Room, exact_depth, room_of
 
 SLACK = 2e-6  # [of a facet's largest coordinate] a point this near to a facet is on it: 30 float32 ulps
@@ -133,17 +133,6 @@ def clearance(g, m, p):
         q = (p[0] - g.balls[b, 0], p[1] - g.balls[b, 1], p[2] - g.balls[b, 2])
         bound = min(bound, abs(math.sqrt(dot(q, q)) - g.balls[b, 3]))
     return bound if g.engines == 0 else min(bound, free_around(g.grid, p))
-
-
-@njit(**KERNEL)
-def slipped(g, sums, m, p, near):
-    """Return whether p, from where the ray engine sees the mesh of medium m from within, is surely outside it, farther
-    than `near`: once in 1e7 times a ray slips through between two facets. `sums` (engines,) is used."""
-    grid = g.grid
-    home, off = home_of(grid, sums, p), free_around(grid, p)
-    for k in range(3):
-        off = max(off, max(grid.low[k] - p[k], p[k] - grid.low[k] - grid.edge * grid.free.shape[k]))
-    return home != m and home != UNKNOWN and off > near
 
 
 @njit(**KERNEL)

@@ -325,6 +325,18 @@ def home_of(grid, sums, p):
     return entered(grid, sums, home)
 
 
+@njit(**KERNEL)
+def slipped(grid, sums, m, p, near):
+    """Return whether p, from where the ray engine sees the mesh of medium m from within, is surely outside it, farther
+    than `near`: once in 1e7 times a ray slips through between two facets. `sums` (meshes,) is used."""
+    if grid.free.shape[0] == 0:  # there is no grid that would know
+        return False
+    home, off = home_of(grid, sums, p), free_around(grid, p)
+    for k in range(3):
+        off = max(off, max(grid.low[k] - p[k], p[k] - grid.low[k] - grid.edge * grid.free.shape[k]))
+    return home != m and home != UNKNOWN and off > near
+
+
 # --------------------------------------------------------------------------------------------- from meshes
 
 

@@ -33,8 +33,8 @@ from tsdf.sampling import GOLDEN, key_of, mix, unit
 from tsdf.vectors import KERNEL, cross, dot, frame, minus, renewed, step, triple
 from tsdf.walk import explicit as X
 from tsdf.walk import memory as M
-from tsdf.walk.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit, slipped, unmet
-from tsdf.walk.grid import GRAZING, home_of, march, plane_hit
+from tsdf.walk.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit, unmet
+from tsdf.walk.grid import GRAZING, home_of, march, plane_hit, slipped
 from tsdf.walk.hybrid import hand_over
 from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, Leaps, leap, missing, patience
 from tsdf.walk.lights import LightArrays
@@ -608,7 +608,7 @@ def fly(world, batch, w, amounts):
             return again(batch, w, slack_m)
         if home == NONE and (inside or t_m < t_b):
             unsure = inside and w.medium == UNKNOWN and g.kind[m] == MESH
-            if unsure and slipped(g, hits[hits.shape[0] - 1], m, p, GRAZING * slack_m):
+            if unsure and slipped(g.grid, hits[hits.shape[0] - 1], m, p, GRAZING * slack_m):
                 continue
             t_b, n_b, slack_b = t_m, n_m, slack_m
             if inside:
