@@ -169,12 +169,13 @@ class _Planning(Evidence):
     def drowned(self, chosen: Prediction, others: Sequence[Prediction]) -> bool:
         """Return whether single grains have less error than the chosen, but such that are left out as mostly noise."""
         limit = self.limit / self.load
-        return self.rarer > 1.0 and any(
-            singly(p.candidate)
-            and p.noise(limit) > UNFINISHED
-            and TIE * p.likely_error(limit) < chosen.likely_error(limit)
-            for p in others
-        )
+        return any(
+            self.unfinished(p) and TIE * p.likely_error(limit) < chosen.likely_error(limit) for p in others
+        )  # fmt: skip
+
+    def unfinished(self, p: Prediction) -> bool:
+        """Return whether single grains under small suns are still but bright dots after the time that there is."""
+        return self.rarer > 1.0 and singly(p.candidate) and p.noise(self.limit / self.load) > UNFINISHED
 
     def settled(self) -> tuple[Prediction, list[Prediction]]:
         """Return what is chosen, which a pilot has seen where one can, and all predictions."""
@@ -422,10 +423,7 @@ class _Planning(Evidence):
         limit = self.limit / self.load
         if not takes <= limit and math.isfinite(limit):
             # sparkle that is not rendered to the end is nothing but noise; and what all miss tells none from the others
-            chance = self.rarer > 1.0
-            aimed = [
-                p for p in found if not (chance and singly(p.candidate) and p.noise(limit) > UNFINISHED)
-            ] or found  # fmt: skip
+            aimed = [p for p in found if not self.unfinished(p)] or found
             least = min(p.likely_error(limit) for p in aimed)
             alike = [p for p in aimed if p.likely_error(limit) <= TIE * least] or aimed  # of pilots without light
             return min(alike, key=lambda p: math.hypot(p.bias, p.bias_error, p.noise(limit)))

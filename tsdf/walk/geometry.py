@@ -23,7 +23,7 @@ from tsdf.grain.meshes import read_mesh
 from tsdf.scene.keys import FARTHEST
 from tsdf.scene.scene import SMALLEST, Box, MediumSpec, Mesh, Rectangle, Scene, Slab, Sphere, SurfaceSpec, called
 from tsdf.vectors import KERNEL, dot, step
-from tsdf.walk.grid import GRAZING, NONE, Grid, free_around, grid_of, march
+from tsdf.walk.grid import GRAZING, NONE, ROUNDING, Grid, free_around, grid_of, march
 from tsdf.walk.room import BALL, BOX, CLOSED, MESH, OPEN, SLAB, Room, exact_depth, room_of
 
 SLACK = 2e-6  # [of a facet's largest coordinate] a point this near to a facet is on it: 30 float32 ulps
@@ -31,7 +31,6 @@ GRID_CELLS = 2_000_000  # of the grid of facets: half a second to make
 RANGE = 1e6  # of the largest coordinate to the smallest extent of a medium, which a facet that large blurs
 DIGITS = 1e-9  # of a coordinate is the least size there
 LEAST_OVERLAP = 1e-3  # [of the smaller extent] media that overlap by less only touch
-ROUNDING = 1e-13  # of coordinates: what leans outward by less is flat
 NEAR = 1e-4  # of a way or a ball's radius: what passes a ball so near is looked at with more care
 
 

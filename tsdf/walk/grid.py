@@ -24,7 +24,7 @@ BATCH = 1 << 17  # triangles and boxes that are looked at together
 PAD = 0.004  # [cells] facets count as in a cell when this near to it, far more than the rounding of the way through
 GRAZING = 100.0  # times its thickness is the most that a point is moved off a facet along a ray
 FEW = 3  # facets in a cell, below which nothing is gained by looking whether they all are on one side
-ROUNDING = 1e-13  # of coordinates: some hundreds of the last bits of heights
+ROUNDING = 1e-13  # of coordinates: some hundreds of the last bits of heights; what leans outward by less is flat
 NEAR = 1e-7  # [cells] that near to a facet, on which side of it a place is is not asked
 NONE, UNKNOWN = -1, -2
 
@@ -294,13 +294,14 @@ def crossings(grid, sums, cell, line, p, q):
 
 @njit(**KERNEL)
 def entered(grid, sums, home):
-    """Return the medium that holds a place, after so many crossings (meshes,) from a place that one holds; the first,
-    should there be more."""
+    """Return the medium that holds a place, after so many crossings (meshes,) from one that `home` holds: NONE, or
+    UNKNOWN where several do."""
+    found = NONE
     for e in range(sums.shape[0]):
         m = grid.owner[e]
         if m != NONE and sums[e] + (1 if m == home else 0) > 0:
-            return m
-    return NONE
+            found = m if found == NONE else UNKNOWN
+    return found
 
 
 @njit(**KERNEL)
@@ -359,12 +360,7 @@ def find_homes(grid, home, sums):
                     wall = (grid.low[0] + i * grid.edge, here[1], here[2])
                     crossings(grid, sums, last, line, before, wall)
                     crossings(grid, sums, cell, line, wall, here)
-                    now, holders = NONE, 0
-                    for e in range(sums.shape[0]):
-                        if grid.owner[e] != NONE and sums[e] > 0:
-                            now, holders = grid.owner[e], holders + 1
-                    if holders > 1:
-                        now = UNKNOWN
+                    now = entered(grid, sums, NONE)
                 home[cell], before = now, here
             if now != NONE:  # these are no closed meshes
                 for i in range(nx):
