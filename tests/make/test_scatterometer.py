@@ -568,6 +568,31 @@ def test_merging_cells_keeps_the_sums() -> None:
         assert np.all(np.diff(edges[1:-1]) > 0)
 
 
+@pytest.mark.parametrize("cells", [8, 16, 100, 333, 512, 1024])
+def test_parts_of_columns(cells: int) -> None:
+    """Sums over parts, what they have beside their share of the column, and its variance, as numpy finds them."""
+    tally = Tally()
+    rng = np.random.default_rng(cells)
+    tally.theta[:] = rng.integers(0, 1 << 30, tally.theta.shape)
+    tally.scalars[:, T.SCATTERED] = tally.theta.sum(axis=1)
+    errors = statistics.TableErrors(tally)
+    columns = statistics.columns_of(errors._theta, cells)[:, -2:0:-1]
+    for parts in (1, 2, 4):
+        cuts, finer = errors._parts(cells, parts)
+        assert (finer == np.add.reduceat(errors._theta[:, : T.FINE], cuts[:-1], axis=1)).all()
+        assert parts > 1 or (finer == columns).all()
+        share = rng.random((cells, parts))
+        found = np.zeros((2, cells, parts))
+        statistics._deviations(finer.reshape(-1, cells, parts), np.ascontiguousarray(columns), share, found)
+        deviations = finer.reshape(-1, cells, parts) - columns[:, :, None] * share
+        assert (found[0] == deviations.mean(axis=0)).all()
+        assert found[1] == pytest.approx(deviations.var(axis=0, ddof=1) / T.REPLICATES, rel=1e-9)
+    values = rng.normal(size=cells)
+    window = min(17, cells)
+    around = [values[max(0, i - window // 2) : i + (window + 1) // 2].mean() for i in range(cells)]
+    assert statistics._pooled(values, window) == pytest.approx(np.array(around), rel=1e-9, abs=1e-12)
+
+
 @pytest.mark.slow
 def test_records_by_entry_keep_the_means_of_all_paths():
     """A chain of grains multiplies what its records get wrong, so the mean deflection and offset are those of the
