@@ -210,6 +210,29 @@ def test_leaps_are_candidates_of_the_levels_that_leap(ball: Scene) -> None:
     assert len(widths) >= 2
 
 
+def test_of_many_candidates_few_are_named(found: Frontier) -> None:
+    """All of a few; of many the least error at any time, and of each level the least floor."""
+    assert frontier_plots.named(found, 0.1, 100.0) == list(found.rows)
+    row = found.rows[0]
+
+    def made(level: str, grains: int, floor: float, noise: float) -> Measured:
+        runs = (1.0,) * found.runs
+        squares = tuple(floor**2 * (1.0 + 0.01 * (-1) ** k) for k in range(found.runs))
+        return replace(row, candidate=Candidate(level, grains), seconds=runs, noise=(noise**2,) * found.runs,
+                       squares=squares)  # fmt: skip
+
+    rows = [made("teleport", k, 0.01 + 0.001 * k, 0.5) for k in range(9)]
+    rows += [made("teleport-joint", k, 0.02 - 0.001 * k, 0.5) for k in range(9)]
+    rows += [made("isotropic", 0, 0.3, 0.001), made("volume", 0, 0.005, 0.1), made("volume", 1, 0.006, 0.05)]
+    many = replace(found, rows=tuple(rows))
+    names = [str(one.candidate) for one in frontier_plots.named(many, 0.01, 1000.0)]
+    assert names == ["teleport", "teleport-joint k=8", "isotropic", "volume", "volume k=1"]
+    figure = frontier_plots.plot_frontier(many)
+    beside = [text.get_text().split("  ")[0] for text in figure.axes[0].texts if text.get_text()]
+    assert beside == names
+    assert f"{len(names)} of 21 named" in figure.get_suptitle()
+
+
 def test_bytes_are_of_what_a_level_draws_from(found: Frontier) -> None:
     """Cheaper levels hold less, explicit grains hold more, and points know no table."""
     held = {str(row.candidate): row.bytes for row in found.rows}
