@@ -137,6 +137,27 @@ def test_part_of_another_build_is_refused(octahedron: Grain, tmp_path: Path) -> 
         merge([tmp_path / "a", tmp_path / "b"])
 
 
+def test_no_save_waits_for_what_is_sought(octahedron: Grain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The extent of a huge mesh takes seconds: paths are safe before it is found, and the table has it all the same."""
+    part, there = tmp_path / "x.part", []
+    sought = scatterometer.extent_header
+
+    def late(grain: Grain) -> dict[str, float]:
+        end = time.monotonic() + 20.0
+        while not part.exists() and time.monotonic() < end:
+            time.sleep(0.01)
+        there.append(part.exists())
+        return sought(grain)
+
+    monkeypatch.setattr(scatterometer, "extent_header", late)
+    monkeypatch.setattr(scatterometer, "SAVE_S", 0.0)
+    build = Build.start(octahedron, Optics(1.31), Effort(paths=40_000))
+    build.run(octahedron, 1, part_file=part)
+    assert there == [True]
+    whole = Build.load(part).table()
+    assert whole.header["grain"]["x_sieve"] == build.table().header["grain"]["x_sieve"] > 0.0
+
+
 def test_resuming_gives_the_same_bytes(octahedron: Grain, reference: bytes, tmp_path: Path) -> None:
     """Stop when the first paths are done, as Ctrl-C would, and go on from the part file."""
     part = tmp_path / "x.part"

@@ -331,17 +331,20 @@ class Build:
                     progress.error = self.error()
                 self.check_leaks()
                 if part_file is not None and now - saved > SAVE_S:
-                    self.save(part_file)
+                    self.save(part_file, whole=self._whole(part))
                     saved = time.monotonic()
         if part_file is not None and (self.done or not leave.is_set()):
-            self.save(part_file)
+            self.save(part_file, whole=not leave.is_set() or self._whole(part))
 
     def _complete(self, part: tuple[int, int], part_file: Path | None, progress: Progress, deadline: float) -> bool:
         """Return whether nothing is to be traced: all is done, and meets the target, or it is too late for more."""
         if self.done and deadline <= time.monotonic():
             return True
-        whole = without(self._wanted(part), self.done) == []
-        return whole and (self.effort.target_error is None or self._judge_and_save(progress, part_file))
+        return self._whole(part) and (self.effort.target_error is None or self._judge_and_save(progress, part_file))
+
+    def _whole(self, part: tuple[int, int]) -> bool:
+        """Return whether no path is missing."""
+        return without(self._wanted(part), self.done) == []
 
     def _left(self, part: tuple[int, int], ahead: Spans) -> Spans:
         """Return which paths are wanted beside those `ahead`; more than the target needs while it is judged."""
@@ -428,15 +431,22 @@ class Build:
         tally = self.tally.narrowed(made.joint, made.memory)
         return assemble.traced_table(tally, error.cells, self.grain, self.optics, provenance, made.memory)
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path, whole: bool = True) -> None:
         """Write the part file, atomically.
+
+        Parameters
+        ----------
+        whole : bool
+            Whether a table may be made of it without the mesh: then what is still sought is waited for, of a huge mesh
+            some seconds.
 
         Raises
         ------
         TSDFError
             If it cannot be written; the file that stood there is left as it was.
         """
-        self._find()
+        if whole:
+            self._find()
         request = json.dumps({**self.origin, "effort": asdict(self.effort), "judgement": self.judgement})
         kept: dict[str, np.ndarray] = {
             archive.PART: np.frombuffer(request.encode(), dtype=np.uint8),
