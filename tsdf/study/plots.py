@@ -290,7 +290,8 @@ def plot_preview(found: Preview, notes: Sequence[str]) -> Any:
             axes.set_axis_off()
         for axes, panel in zip(grid.flat, found.panels, strict=False):
             axes.imshow(panel.rgb, interpolation="bilinear", aspect="equal")
-            axes.set_title(panel.title)
+            noise = f", noise {100.0 * panel.error:.2g} %" if math.isfinite(panel.error) else ""
+            axes.set_title(f"{panel.title}{noise}")
             bold = {"transform": axes.transAxes, "va": "top", "weight": "bold", "fontsize": 8.0}
             axes.text(0.0, -0.03, str(panel.advice), **bold)
             why = textwrap.wrap(panel.advice.reason, 62) + textwrap.wrap(panel.drawn, 62)
