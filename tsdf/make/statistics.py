@@ -211,9 +211,13 @@ class TableErrors:
             best = min((i for i in (best - step, best, best + step) if 0 <= i <= last), key=self._variation)
         return self(self._candidates[best])
 
+    def meets(self, target: float) -> bool:
+        """Return whether some number of cells meets a target."""
+        return self.rough().total_variation <= NEAR * target and self.best().total_variation <= target
+
     def fewest(self, target: float) -> TableError | None:
         """Return the error of the fewest cells that meet a target, by bisection, or None if none does."""
-        if self.rough().total_variation > NEAR * target or self.best().total_variation > target:
+        if not self.meets(target):
             return None
         low, high = -1, self._candidates.index(self.best().cells)
         while high - low > 1:
