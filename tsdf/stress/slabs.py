@@ -190,7 +190,7 @@ def _slab(
 
 
 ROWS = (
-    _slab("thin", "layer of 2 R", Case("ball", 0.6, 2.0, times=3, packings=16), 6.0),
+    _slab("thin", "layer of 2 R", Case("ball", 0.6, 2.0, times=3, packings=32), 6.0),
     _slab(
         "monolayer",
         "layer of .5 R, light at 60 degrees",
