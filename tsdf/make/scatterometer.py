@@ -166,6 +166,7 @@ class Build:
         if self._latest is None or self._latest[0] != self.paths:
             errors, target = self._errors(), self.effort.target_error
             self._latest = self.paths, (errors.fewest(target) if target is not None else None) or errors.best()
+            self._judged = None  # 25 MB
         return self._latest[1]
 
     def _errors(self) -> statistics.TableErrors:
