@@ -223,7 +223,7 @@ ROWS = (
     _slab(
         "eta-102",
         "layer of 40 R, eta = 1.02",
-        Case("nearly", 0.6, 40.0, times=6, packings=16),
+        Case("nearly", 0.6, 40.0, times=10, packings=16),
         6.0,
         FORGETFUL,
         False,
