@@ -24,6 +24,8 @@ ALIKE = 0.2  # of the logarithm of an error, what two levels of teleportation ma
 LEAST = 1e-4  # [1] of an error
 UNSURE = 0.8  # of the logarithm of texture, what that law may be off by for other grains than spheres
 FADING = 0.3  # of the logarithm of texture, what that law may be off by; and of what is left of a bias
+RESOLVED = 3.0  # times what noise makes of it, from which on it is asked who makes a square
+USUAL = 0.15  # of a square, that a fiftieth of the pixels make, of numbers that are normal
 FLAT = 0.1  # share of light that goes straight on from which on grains are flat all over
 BOLD = 1.0  # [l*] least radius of leaps that are bolder than they are by default
 BOLD_BIAS = 0.006  # [1] that they may be off by (docs/leaps.md)
@@ -105,8 +107,23 @@ class Evidence:
             return None
         if not self.trusted(own) or not self.trusted(other):
             return None
-        seen, more = own.apart(other), self.sparkle
+        seen, more = self.elsewhere(candidate, own.apart(other)), self.sparkle
         return seen._replace(square=more * seen.square, square_error=more * seen.square_error)
+
+    def elsewhere(self, candidate: Candidate, seen: Apart) -> Apart:
+        """Return how a candidate without explicit grains differs from the reference, with what one that looked at more
+        pixels has found there: all miss the same glints."""
+        assert self.reference is not None
+        own, other = self.pilots[candidate], self.pilots[self.reference]
+        wide = [p for c, p in self.pilots.items() if not c.explicit_grains and p is not other]
+        best = max((p for p in wide if self.trusted(p)), key=lambda p: int(p.looked.sum()), default=own)
+        if candidate.explicit_grains or best.looked.sum() <= own.looked.sum():
+            return seen
+        whole, part = best.apart(other), best.apart(other, own)
+        unsure = part.square_error + LEAST**2
+        alike = min((max(seen.square, 0.0) + unsure) / (max(part.square, 0.0) + unsure), 1.0)
+        square = seen.square + alike * (whole.square - part.square)
+        return seen._replace(square=square, square_error=max(seen.square_error, alike * whole.square_error))
 
     @property
     def sparkle(self) -> float:
@@ -200,9 +217,15 @@ class Evidence:
         """Return the candidate without single grains whose pilot says most of the texture that it misses."""
         alike = [c for c in self.pilots if not c.explicit_grains and not LEVELS[c.level].traits.packed]
         seen = {c: apart for c in alike if (apart := self.apart(c)) is not None}
-        # by the error of texture squared, not by its value: the least of several values is too small
+        # by the error of texture squared, not by its value: the least of several values is too small; and of few pixels
+        # neither is known
         return min(
-            seen, key=lambda c: math.hypot(seen[c].square_error, 2.0 * seen[c].bias * seen[c].bias_error), default=None
+            seen,
+            key=lambda c: (
+                -int(self.pilots[c].looked.sum()),
+                math.hypot(seen[c].square_error, 2.0 * seen[c].bias * seen[c].bias_error),
+            ),
+            default=None,
         )
 
     def rougher(self) -> float:
@@ -242,7 +265,9 @@ class Evidence:
         if k == before:
             return bias, bias_error, floor
         off = min(math.hypot(bias, bias_error), floor.value)
-        left = math.exp((before - k) * max(1.0 / self.per_e, self.lasting))
+        # light that a few bright paths bring does not get weaker with the grains that it has met, but rarer
+        lasting = self.lasting * (1.0 - 0.5 * self.glinting)
+        left = math.exp((before - k) * max(1.0 / self.per_e, lasting))
         if self.far and not before:
             left = min(1.0, self.ratio * left)
         packing, alike = self.of_one_packing(one), math.exp((before - k) * self.lasting)
@@ -253,6 +278,15 @@ class Evidence:
         value = math.hypot(texture, min(math.hypot(bias, bias_error), floor.value))
         unsure = math.hypot(floor.error * left, FADING * texture)
         return bias, bias_error, Belief(value, math.hypot(unsure, 0.5 * min(bias_error, value)))
+
+    @property
+    def glinting(self) -> float:
+        """Which share of the square of what levels miss a few pixels make, beyond what they do of any texture [1]."""
+        best = self.best_known()
+        seen = self.apart(best) if best is not None else None
+        if seen is None or not seen.square > RESOLVED * self.sparkle * seen.noise:
+            return 0.0
+        return max(seen.few - USUAL, 0.0) / (1.0 - USUAL)
 
     @property
     def per_e(self) -> float:

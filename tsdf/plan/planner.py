@@ -6,9 +6,9 @@ What is expected of a scene is `prior`, what short renders of it show is `pilot`
 
 import math
 import os
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from threading import Event
 
 from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
@@ -17,7 +17,7 @@ from tsdf.picture.trust import kurtosis_of
 from tsdf.picture.world import World, build
 from tsdf.plan import needs, prior
 from tsdf.plan.evidence import BOLD, BOLD_BIAS, GRAINS, MEETINGS, Evidence, singly
-from tsdf.plan.pilot import FEWEST, HALVES, PIXELS, Pilot
+from tsdf.plan.pilot import CLOCKS, FEWEST, HALVES, MORE, PIXELS, Clocks, Pilot
 from tsdf.plan.prediction import TIE, Plan, Prediction
 from tsdf.plan.report import BUSY, digits, why
 from tsdf.scene.levels import LEVELS
@@ -27,7 +27,7 @@ from tsdf.scene.specs import SunLight
 from tsdf.spheres.packing import MAX as MOST_PACKED
 from tsdf.study.candidates import Candidate, candidates, taken
 from tsdf.walk.explicit import Packed, mesh_beside
-from tsdf.walk.geometry import Place
+from tsdf.walk.geometry import Place, place
 
 TARGET = 0.02  # [1] where nothing else is asked for
 LEAST_TARGET, MOST_TARGET = 1e-4, 1.0
@@ -45,6 +45,7 @@ BRIEF, MOST_CHECKS = 0.3, 3  # [s] that such a look takes at least, and how many
 WIDE, WIDEST = 16.0, 50.0  # [deg] of suns in pilots that are smaller in the picture, which single grains would hardly
 # ever meet, at least and at most
 UNFINISHED = 0.5  # [1] noise of pixels over their mean, above which single grains under small suns are but bright dots
+TAILED = 2.0  # times what noise makes of it, that the error bar of what is missed is where few pixels make most of it
 SOON = 0.5  # of `MEETINGS`, after the first round, that there will be enough of after the second
 ENOUGH = 4.0  # times `MEETINGS` that they are to be met in the time that the reference has
 NEAR = 3.0  # times as long as the best as a candidate may seem to take to be looked at again
@@ -70,7 +71,8 @@ def checked_target(target: float, name: str = "target") -> float:
 
 def plan(
     scene: Scene, target: float = TARGET, seconds: float | None = None, spp: int | None = None, seed: int | None = None,
-    threads: int | None = None, told: Callable[[float, str], None] | None = None,
+    threads: int | None = None, told: Callable[[float, str], None] | None = None, stop: Event | None = None,
+    clocks: Clocks | None = None,
 ) -> Plan:  # fmt: skip
     """Return how a scene is best rendered.
 
@@ -91,7 +93,11 @@ def plan(
     threads : int, optional
         All processors by default.
     told : callable, optional
-        Called with the share done and a word about it.
+        Called with the share done and a word about it; the share is above 0 from when something is known.
+    stop : Event, optional
+        Set by others to end early; the plan is then what is known so far.
+    clocks : Clocks, optional
+        What time is read from; others than the machine's make plans that can be made again to the last bit.
 
     Raises
     ------
@@ -104,7 +110,7 @@ def plan(
     if scene.render.explicit_grains:
         raise UsageError(f"{scene.name}: explicit_grains is what a plan chooses; leave it out, or name a level")
     run = _Planning(scene, target, seconds, scene.render.seed if seed is None else seed, threads or os.cpu_count() or 1)
-    run.spp = spp
+    run.spp, run.clocks, run.stop = spp, clocks or CLOCKS, stop or Event()
     run.told = told or (lambda share, word: None)
     return run.plan()
 
@@ -119,7 +125,7 @@ class _Planning(Evidence):
         self.said = seconds is not None and math.isfinite(seconds)  # whether that long is meant, and not at most
         self.told: Callable[[float, str], None] = lambda share, word: None
         self.scene, self.tables = loaded(scene)  # as pilots see it
-        self.looked_at = PIXELS
+        self.looked_at, self.wider = PIXELS, False
         self.named = [
             (str(spec.table), table)
             for spec, table in zip((g for m in scene.media for g in m.grains), self.tables, strict=True)
@@ -128,7 +134,8 @@ class _Planning(Evidence):
         self.notes: list[str] = []
         self.budget = max(SECONDS, min(SHARE * self.limit, MOST_SECONDS)) if self.said else SECONDS
         self.spp: int | None = None
-        self.spent, self.load, self.began = 0.0, 1.0, time.perf_counter()
+        self.clocks, self.stop = CLOCKS, Event()
+        self.spent, self.load, self.known = 0.0, 1.0, 0.0
         self.ends = self.budget  # of the time that is spent
         self.places: dict[bool, Place] = {}
         self.packings: dict[bool, Packed] = {}
@@ -137,6 +144,7 @@ class _Planning(Evidence):
 
     def plan(self) -> Plan:
         """Return the plan."""
+        began = self.clocks.wall()
         self.told(0.0, "planning")
         self.look()
         self.refer()
@@ -147,8 +155,11 @@ class _Planning(Evidence):
         left = max(self.budget - self.spent, LEAST_PILOTS)
         self.ends = self.spent + left
         self.round(FIRST * left, list(self.pilots))
+        self.known = FIRST
         self.refer_anew(SOON)
-        self.round((1.0 - FIRST - CHECK) * left, self.finalists())
+        glints = self.look_wider()
+        self.round((1.0 - FIRST - CHECK) * left, list(dict.fromkeys((*self.finalists(), *glints))))
+        self.known = 1.0 - CHECK
         self.refer_anew()
         self.weigh()
         chosen, found = self.settled()
@@ -161,17 +172,19 @@ class _Planning(Evidence):
         )  # fmt: skip
         made = Plan(
             self.asked, self.target, self.limit if self.said or beyond else None, (chosen, *rest), far, (),
-            tuple(lacking), tuple(self.notes), self.spent, time.perf_counter() - self.began, self.threads, self.load,
-            self.spp, beyond and self.drowned(chosen, rest),
+            tuple(lacking), tuple(self.notes), self.spent, self.clocks.wall() - began, self.threads, self.load,
+            self.spp, self.drowned(chosen, rest) if beyond else 0.0, 2.0 / max(self.footprint, 1e-6),
         )  # fmt: skip
         return replace(made, why=why(made, self.bodies, self.footprint, self.coverage, str(self.reference)))
 
-    def drowned(self, chosen: Prediction, others: Sequence[Prediction]) -> bool:
-        """Return whether single grains have less error than the chosen, but such that are left out as mostly noise."""
+    def drowned(self, chosen: Prediction, others: Sequence[Prediction]) -> float:
+        """Return from when on single grains are taken [s] that have less error than the chosen but are left out, as
+        mostly noise; 0 where there are none."""
         limit = self.limit / self.load
-        return any(
-            self.unfinished(p) and TIE * p.likely_error(limit) < chosen.likely_error(limit) for p in others
-        )  # fmt: skip
+        left_out = [
+            p for p in others if self.unfinished(p) and TIE * p.likely_error(limit) < chosen.likely_error(limit)
+        ]
+        return self.load * min((p.variance * p.turn / UNFINISHED**2 for p in left_out), default=0.0)
 
     def unfinished(self, p: Prediction) -> bool:
         """Return whether single grains under small suns are still but bright dots after the time that there is."""
@@ -181,7 +194,7 @@ class _Planning(Evidence):
         """Return what is chosen, which a pilot has seen where one can, and all predictions."""
         for looks in range(MOST_CHECKS):
             one = self.choose(self.predictions()).candidate
-            if one in self.pilots or (looks and self.spent > self.ends):
+            if one in self.pilots or (looks and self.spent > self.ends) or self.stopped():
                 break
             if self.dear and LEVELS[one.level].traits.packed:
                 if self.possible(one) is not None:
@@ -194,7 +207,7 @@ class _Planning(Evidence):
             p for p in found if p.candidate in self.pilots or (self.dear and LEVELS[p.candidate.level].traits.packed)
         ]
         chosen = self.choose(seen or found)
-        if (bold := self.bolder_of(chosen)) is not None and self.add(bold):
+        if not self.stopped() and (bold := self.bolder_of(chosen)) is not None and self.add(bold):
             self.round(max(self.ends - self.spent, BRIEF), [chosen.candidate, bold], 0.0)
             found = self.predictions()
             chosen = self.choose([p for p in found if p.candidate in (chosen.candidate, bold)])
@@ -216,7 +229,9 @@ class _Planning(Evidence):
 
     def look(self) -> None:
         """See how large grains look and what is expected of the levels."""
-        began = time.process_time()
+        began = self.clocks.process()
+        if all(medium.inside == "grains" for medium in self.scene.media):
+            self.places = dict.fromkeys((False, True), place(self.scene, grains=True))  # one for all levels
         world = build(self.scene, "volume", leap=0.0, places=self.places)
         self.bodies = prior.bodies(world, self.tables)
         self.footprint, self.coverage, self.ratio = prior.looks(world)
@@ -231,7 +246,7 @@ class _Planning(Evidence):
                 "the scene lies outside the atlas of level errors: what no pilot has seen is known within a factor of "
                 f"{math.exp(2.0 * prior.SPREAD):.0f} only"
             )
-        self.spent += time.process_time() - began
+        self.spent += self.clocks.process() - began
 
     def widen(self) -> None:
         """Have pilots look at suns that single grains meet often enough to tell what other levels miss."""
@@ -240,7 +255,7 @@ class _Planning(Evidence):
         self.wide = min(max(WIDE, math.degrees(4.0 * math.asin(math.sqrt(min(share, 1.0))))), WIDEST)
         lights = tuple(
             replace(light, angular_diameter_deg=self.wide)
-            if isinstance(light, SunLight) and light.angular_diameter_deg < WIDE
+            if isinstance(light, SunLight) and light.angular_diameter_deg < self.wide
             else light
             for light in self.scene.lights
         )
@@ -281,7 +296,13 @@ class _Planning(Evidence):
         try:
             scene = taken(self.scene, candidate)
             scene = replace(scene, render=replace(scene.render, fewer_far=self.far and candidate.explicit_grains > 0))
-            return build(scene, candidate.level, progress=self.told, places=self.places, packings=self.packings)
+            return build(
+                scene,
+                candidate.level,
+                progress=self.building,
+                places=self.places,
+                packings=self.packings,
+            )
         except (SceneError, UsageError) as error:
             if not candidate.explicit_grains:
                 self.impossible[candidate.level] = error
@@ -289,13 +310,15 @@ class _Planning(Evidence):
 
     def add(self, candidate: Candidate) -> bool:
         """Make a candidate ready for pilots, if it is possible; kernels are compiled outside the time."""
-        self.told(0.0, f"building {candidate}")
-        began = time.process_time()
+        self.told(self.known, f"building {candidate}")
+        began = self.clocks.process()
         world = self.possible(candidate)
-        self.spent += time.process_time() - began
+        self.spent += self.clocks.process() - began
         if world is None:
             return False
-        self.pilots[candidate] = Pilot(world, self.seed, self.threads, self.looked_at)
+        pilot = self.pilots[candidate] = Pilot(world, self.seed, self.threads, self.looked_at, self.clocks)
+        if self.wider:
+            pilot.look_wider(MORE)
         self.pilots[candidate].warm()
         return True
 
@@ -354,6 +377,19 @@ class _Planning(Evidence):
 
     # ------------------------------------------------------------------------------------------------ rounds
 
+    def look_wider(self) -> list[Candidate]:
+        """Have pilots look at more pixels, where few of those that they looked at make most of what others miss: how
+        large that is so few cannot tell. Return what is to be piloted for it."""
+        best = self.best_known()
+        seen = self.apart(best) if best is not None and self.looked_at == PIXELS else None
+        if best is None or seen is None or seen.square_error < TAILED * self.sparkle * seen.noise:
+            return []
+        self.wider = True
+        for one in {best, self.reference} | {c for c in self.pilots if c.explicit_grains}:
+            if one is not None:
+                self.pilots[one].look_wider(MORE)
+        return [best]
+
     def round(self, seconds: float, some: list[Candidate], of_reference: float = OF_REFERENCE) -> None:
         """Pilot some candidates for about so long in all [s], of which the reference gets a share."""
         rest = [one for one in some if one != self.reference]
@@ -361,11 +397,19 @@ class _Planning(Evidence):
         own = seconds * (of_reference if rest else 1.0)
         shares = {self.reference: own} if own else {}
         for one, share in (shares | dict.fromkeys(rest, (seconds - own) / max(len(rest), 1))).items():
-            self.told(0.0, f"piloting {one}")
+            self.told(self.known, f"piloting {one}")
             pilot = self.pilots[one]
             before = pilot.busy
-            pilot.run(share)
+            pilot.run(share, self.stopped)
             self.spent += (pilot.busy - before) / self.threads
+
+    def building(self, share: float, word: str) -> None:
+        """Say what is being built."""
+        self.told(self.known, word)
+
+    def stopped(self) -> bool:
+        """Return whether somebody wants the plan as it is, and there is one."""
+        return self.known > 0.0 and self.stop.is_set()
 
     def weigh(self) -> None:
         """See how much longer things take than they would if processors had nothing else to do."""
@@ -375,6 +419,8 @@ class _Planning(Evidence):
             self.notes.append(
                 f"processors are busy with other things: now everything takes {self.load:.1f} times as long"
             )
+        if self.stopped():
+            self.notes.append("planning was interrupted: this is what pilots had seen by then")
         assert self.reference is not None
         if not any(pilot.seen.mean > 0.0 for pilot in self.pilots.values()):
             self.notes.append("no pilot has seen any light: nothing is known of noise, and errors are expected ones")
@@ -399,7 +445,7 @@ class _Planning(Evidence):
         best = min(p.safe_seconds(self.target) for p in found)
         may = sorted((p for p in found if self.hopeful(p) <= NEAR * best), key=self.hopeful)
         first = []
-        for p in may[:MOST_FINALISTS]:
+        for p in may[: 0 if self.stopped() else MOST_FINALISTS]:
             if p.candidate in self.pilots or (self.spent < LATEST * self.budget and self.add(p.candidate)):
                 first.append(p.candidate)
         return first

@@ -10,6 +10,9 @@ from tsdf.study.candidates import Candidate, taken
 TIE = 1.1  # times as long as the cheapest as it may take, of those the one with the least error is taken
 
 
+BLOCK = 16  # pixels across, of whose means the error is said where that of a pixel says little
+
+
 @dataclass(frozen=True)
 class Prediction:
     """What is predicted of a candidate; errors over the mean of the picture [1].
@@ -49,6 +52,12 @@ class Prediction:
     def error(self, seconds: float) -> float:
         """Return the whole error after so long [s]."""
         return math.hypot(self.floor.value, self.noise(seconds))
+
+    def error_of_blocks(self, seconds: float, across: float) -> float:
+        """Return the whole error of the means of `BLOCK` by `BLOCK` pixels after so long [s], if what it misses is
+        alike in so many of them across."""
+        patches = min(max(across, 1.0) / BLOCK, 1.0)
+        return math.hypot(self.bias, self.texture * patches, self.noise(seconds) / BLOCK)
 
     def likely_error(self, seconds: float) -> float:
         """Return the root mean square of the whole error after so long [s], over what the floor may be."""
@@ -96,8 +105,11 @@ class Plan:
         How many times as long things take now as they would if processors had nothing else to do.
     spp : int or None
         Samples per pixel that the picture has, where it is done then.
-    glints : bool
-        Whether single grains would have less error but are left out, for most of it would be the noise of their glints.
+    glints : float
+        Time from which on single grains are taken that are left out, for most of their error would be the noise of
+        their glints [s]; 0 where none are.
+    grain : float
+        How many pixels a grain looks across, about.
     """
 
     scene: Scene
@@ -113,7 +125,8 @@ class Plan:
     threads: int
     load: float = 1.0
     spp: int | None = None
-    glints: bool = False
+    glints: float = 0.0
+    grain: float = 1.0
 
     @property
     def chosen(self) -> Prediction:
