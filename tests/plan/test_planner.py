@@ -536,6 +536,55 @@ def test_few_pixels_do_not_tell_of_glints(ball: tsdf.Table) -> None:
     assert run.pilots[Candidate("teleport")].apart(run.pilots[Candidate("explicit")]).square < 1e-3
 
 
+def test_glints_get_rarer_not_weaker(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of light that is spread over all pixels what is left after k grains is missed in each; of light in a few of them
+    it is missed in as much fewer, and texture falls as the root. What pilots with three grains saw counts beyond them,
+    and of what they saw nothing certain of the law does."""
+    run = planner._Planning(pile(ball, 160.0), 0.05, None, 0, 2)
+    run.look()
+    run.refer()
+    assert run.add(Candidate("volume"))
+    monkeypatch.setattr(planner._Planning, "length", 1.25)
+    whole, one = Belief(0.4, 0.0), run.expected["volume"]._replace(bias=0.0)
+    monkeypatch.setattr(planner._Planning, "of_one_packing", lambda *_: 1.0)
+    left = {}
+    for few, square_error in ((0.1, 1e-4), (1.0, 1e-4)):
+        seen = {Candidate("volume"): Apart(0.0, 1e-4, 0.16, square_error, 1e-4, few)}
+        monkeypatch.setattr(planner._Planning, "apart", lambda _, c, seen=seen: seen.get(c))
+        left[few] = run.faded(one, 0.0, 0.0, whole, 0, 2)[2].value / 0.4
+        assert run.fading is None
+    assert left[0.1] == pytest.approx(0.04, rel=0.01) and left[1.0] == pytest.approx(0.2, rel=0.01)
+    three = Candidate("teleport-memory", 3)
+    assert run.add(three)
+    for square, rate in ((0.16 * math.exp(-2.4), 0.4), (1e-9, None)):
+        seen = {Candidate("volume"): Apart(0.0, 1e-4, 0.16, 1e-6), three: Apart(0.0, 1e-5, square, 1e-5)}
+        monkeypatch.setattr(planner._Planning, "apart", lambda _, c, seen=seen: seen.get(c))
+        assert run.fading == (rate and pytest.approx(rate, rel=0.05))
+    seen[three] = Apart(0.0, 1e-5, 0.16 * math.exp(-2.4), 1e-6)
+    assert run.faded(one, 0.0, 0.0, whole, 3, 8)[2].value == pytest.approx(0.4 * math.exp(-2.0), rel=0.1)
+
+
+def test_glints_that_few_pixels_cannot_have_met(ball: tsdf.Table) -> None:
+    """A sun of 16 degrees is mirrored by one facet in two hundred: sixty pixels may all have missed it, two thousand
+    have not; nor have sixty under a sun of 50 degrees, and spheres show it in every pixel."""
+    for table, degrees, pixels, known in (
+        (tsdf.read(library.ready("salt")), 16.0, 60, False),
+        (tsdf.read(library.ready("salt")), 16.0, 2000, True),
+        (tsdf.read(library.ready("salt")), 50.0, 200, True),
+        (ball, 16.0, 60, True),
+    ):
+        camera = replace(pile(ball, 12.0).camera, width=60, height=45)
+        scene = replace(pile(table, 12.0), lights=(replace(SUN, angular_diameter_deg=degrees), LIGHTS[0]))
+        run = planner._Planning(replace(scene, camera=camera), 0.1, None, 0, 2)
+        run.budget, run.looked_at = 50.0, pixels
+        run.look()
+        run.reference = Candidate("explicit")
+        assert run.add(run.reference)
+        pilot = run.pilots[run.reference]
+        pilot.counts[:], pilot.sums[:] = 1, 1.0
+        assert (run.unseen() < 0.02) == known, run.unseen()
+
+
 def test_errors_of_hundreds_of_per_cent_are_explained(far: Plan) -> None:
     """Where glints make the error of a pixel, that of the mean of many is said: bias stays, noise falls as the root of
     their number, and so does what is missed as far as pixels do not show the same grain."""

@@ -15,6 +15,7 @@ from tsdf.plan.pilot import Apart, Pilot, Seen
 from tsdf.plan.prediction import Prediction
 from tsdf.scene.levels import LEVELS
 from tsdf.study.candidates import Candidate, candidates
+from tsdf.walk.lights import LUMINANCE
 
 GRAINS = (0, 3, 8, 16)  # explicit ones before a chain
 MEETINGS = 400.0  # of lights that are met by chance alone, that a pilot is believed from on: its mean, and what others
@@ -24,6 +25,8 @@ ALIKE = 0.2  # of the logarithm of an error, what two levels of teleportation ma
 LEAST = 1e-4  # [1] of an error
 UNSURE = 0.8  # of the logarithm of texture, what that law may be off by for other grains than spheres
 FADING = 0.3  # of the logarithm of texture, what that law may be off by; and of what is left of a bias
+SLOWEST, FASTEST = 0.1, 3.0  # of the logarithm of texture, that an explicit grain may be seen to take off
+MIRRORED = 0.2  # of a sun's radiance, that is in a glint, about
 RESOLVED = 3.0  # times what noise makes of it, from which on it is asked who makes a square
 USUAL = 0.15  # of a square, that a fiftieth of the pixels make, of numbers that are normal
 FLAT = 0.1  # share of light that goes straight on from which on grains are flat all over
@@ -108,7 +111,20 @@ class Evidence:
         if not self.trusted(own) or not self.trusted(other):
             return None
         seen, more = self.elsewhere(candidate, own.apart(other)), self.sparkle
-        return seen._replace(square=more * seen.square, square_error=more * seen.square_error)
+        error = seen.square_error if candidate.explicit_grains else math.hypot(seen.square_error, self.unseen())
+        return seen._replace(square=more * seen.square, square_error=more * error)
+
+    def unseen(self) -> float:
+        """Return the square of texture that glints of flat facets may make which no pilot has met: one, of a facet that
+        mirrors the brightest sun, as likely as it is that none of those that were looked at does."""
+        assert self.reference is not None
+        pilot = self.pilots[self.reference]
+        suns = pilot.world.lights.sun_radiance @ LUMINANCE
+        if self.atoms < FLAT or not self.chance or not len(suns) or not pilot.seen.mean > 0.0:
+            return 0.0
+        looked, each = int(pilot.looked.sum()), max(self.footprint**2, 1.0)  # pixels; facets in one, about
+        glint = MIRRORED * float(suns.max()) / pilot.seen.mean / each
+        return glint**2 / looked * math.exp(-0.5 * looked * each * self.coverage / self.chance)
 
     def elsewhere(self, candidate: Candidate, seen: Apart) -> Apart:
         """Return how a candidate without explicit grains differs from the reference, with what one that looked at more
@@ -267,7 +283,8 @@ class Evidence:
         off = min(math.hypot(bias, bias_error), floor.value)
         # light that a few bright paths bring does not get weaker with the grains that it has met, but rarer
         lasting = self.lasting * (1.0 - 0.5 * self.glinting)
-        left = math.exp((before - k) * max(1.0 / self.per_e, lasting))
+        rate = max(1.0 / self.per_e, lasting)
+        left = math.exp((before - k) * (self.fading or rate if before else rate))
         if self.far and not before:
             left = min(1.0, self.ratio * left)
         packing, alike = self.of_one_packing(one), math.exp((before - k) * self.lasting)
@@ -287,6 +304,20 @@ class Evidence:
         if seen is None or not seen.square > RESOLVED * self.sparkle * seen.noise:
             return 0.0
         return max(seen.few - USUAL, 0.0) / (1.0 - USUAL)
+
+    @property
+    def fading(self) -> float | None:
+        """Of the logarithm of texture, what each explicit grain takes off, as far as pilots with the first of them and
+        without any saw."""
+        few, best = GRAINS[1], self.best_known()
+        seen = self.seen_after(few)
+        if seen is None or best is None:
+            return None
+        square = seen.square - seen.bias**2
+        if not square > 2.0 * seen.square_error:
+            return None
+        less = self.texture_of(best).value * (self.ratio if self.far else 1.0) / math.sqrt(square)
+        return min(max(math.log(less) / few, SLOWEST), FASTEST)
 
     @property
     def per_e(self) -> float:

@@ -20,6 +20,7 @@ from tsdf.walk import transport
 
 PIXELS, FEWEST = 484, 64  # looked at, at most, and where samples are dear
 MORE = 1936  # looked at where few pixels make most of a difference
+FREE = 0.25  # quantile of times that stands for a processor that has nothing else to do
 FEW = 50  # one pixel in so many may make most of a difference
 LATE = 6.0  # times what is asked for that it may take on the clock, where processors are busy with other things
 HALVES = 2
@@ -85,7 +86,8 @@ class Pilot:
         self.sums, self.squares = np.zeros((HALVES, n, 3)), np.zeros((HALVES, n, 3))
         self.counts, self.active = np.zeros(n, np.int64), 0  # the first of those that samples are taken of now
         self.busy, self.wall = 0.0, 0.0  # [s] of all threads together; on the clock
-        self.timed, self.timed_samples, self.largest = 0.0, 0, 0  # [s] of the largest portions, whose start is no part
+        self.times: list[float] = []  # [s] a sample, of the largest portions, whose start is no part
+        self.largest = 0  # of them, samples
         self._walkers: list[Walkers] = []
 
     @property
@@ -147,14 +149,14 @@ class Pilot:
 
         size = each * len(active)
         if size > 2 * self.largest:
-            self.timed, self.timed_samples, self.largest = 0.0, 0, size
+            self.times, self.largest = [], size
         with ThreadPoolExecutor(self.threads) as pool:
             for half, radiance, spent in pool.map(work, jobs):
                 self.sums[half, self.active :] += radiance.sum(axis=1)
                 self.squares[half, self.active :] += (radiance**2).sum(axis=1)
                 self.busy += spent
                 if 2 * size > self.largest:
-                    self.timed, self.timed_samples = self.timed + spent, self.timed_samples + radiance[..., 0].size
+                    self.times.append(spent / size)
         self.counts[self.active :] += self.threads * each
 
     @property
@@ -167,7 +169,8 @@ class Pilot:
         """What it saw so far."""
         seen = self.looked
         count, samples = HALVES * self.counts[seen][:, None], HALVES * int(self.counts.sum())
-        each, met = self.timed / max(self.timed_samples, 1), self.events / max(samples, 1)
+        # other work on the machine only adds to it
+        each, met = float(np.quantile(self.times or [0.0], FREE)), self.events / max(samples, 1)
         if not samples:
             return Seen(0.0, math.inf, each, met, 0)
         means, squares = self.sums.sum(axis=0)[seen] / count, self.squares.sum(axis=0)[seen] / count

@@ -152,6 +152,7 @@ class _Planning(Evidence):
             if self.deep and self.spent > BUILDING * self.budget and len(self.pilots) > 2:
                 break
             self.add(Candidate(level))
+        self.look_deeper()
         left = max(self.budget - self.spent, LEAST_PILOTS)
         self.ends = self.spent + left
         self.round(FIRST * left, list(self.pilots))
@@ -377,12 +378,22 @@ class _Planning(Evidence):
 
     # ------------------------------------------------------------------------------------------------ rounds
 
+    def look_deeper(self) -> None:
+        """Have the best chain be piloted with a few explicit grains first, where it is likely to need some: how fast
+        what is missed falls with their number is seen better than foreseen."""
+        chain = next((c for c in self.pilots if LEVELS[c.level].traits.chains), None)
+        if chain is None or self.dear or self.expected[chain.level].texture < self.target:
+            return
+        self.add(chain._replace(explicit_grains=GRAINS[1]))
+
     def look_wider(self) -> list[Candidate]:
         """Have pilots look at more pixels, where few of those that they looked at make most of what others miss: how
         large that is so few cannot tell. Return what is to be piloted for it."""
         best = self.best_known()
         seen = self.apart(best) if best is not None and self.looked_at == PIXELS else None
-        if best is None or seen is None or seen.square_error < TAILED * self.sparkle * seen.noise:
+        if best is None or seen is None:
+            return []
+        if seen.square_error < TAILED * self.sparkle * seen.noise:
             return []
         self.wider = True
         for one in {best, self.reference} | {c for c in self.pilots if c.explicit_grains}:
