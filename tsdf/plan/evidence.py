@@ -26,6 +26,7 @@ LEAST = 1e-4  # [1] of an error
 UNSURE = 0.8  # of the logarithm of texture, what that law may be off by for other grains than spheres
 FADING = 0.3  # of the logarithm of texture, what that law may be off by; and of what is left of a bias
 SLOWEST, FASTEST = 0.1, 3.0  # of the logarithm of texture, that an explicit grain may be seen to take off
+SLANTED = 1.3  # times as long as a layer is thick, that light crosses it
 MIRRORED = 0.2  # of a sun's radiance, that is in a glint, about
 RESOLVED = 3.0  # times what noise makes of it, from which on it is asked who makes a square
 USUAL = 0.15  # of a square, that a fiftieth of the pixels make, of numbers that are normal
@@ -329,7 +330,16 @@ class Evidence:
     def length(self) -> float:
         """How many grains light meets that meets any, by the reference: with fewer still to come less can be missed."""
         assert self.reference is not None
-        return max(self.pilots[self.reference].seen.events / max(self.coverage, 1e-9), 1.0)
+        return max(self.pilots[self.reference].seen.events / max(self.coverage * self.struck, 1e-9), 1.0)
+
+    @property
+    def struck(self) -> float:
+        """Share of the light that meets any grain of that which comes into the medium of which most is, about."""
+        struck = 1.0
+        for body in self.bodies:  # transport mean free paths are mean free paths over 1 - g
+            layer = max(body.thickness - 2.0 * body.whole, 0.5) / max(1.0 - body.mean_cosine, 1e-9)
+            struck = min(struck, -math.expm1(-SLANTED * layer / body.transport))
+        return struck
 
     @property
     def lasting(self) -> float:
@@ -368,7 +378,8 @@ class Evidence:
         if level == "explicit":
             return best._replace(seconds=self.explicit_sample), False
         plain = self.pilots.get(Candidate(level))
-        near = next((self.pilots[Candidate(o)] for o in ("teleport-memory", "teleport", "volume")
+        alike = ("volume-hg", "isotropic") if LEVELS[level].traits.points else ()  # whose light all aims
+        near = next((self.pilots[Candidate(o)] for o in (*alike, "teleport-memory", "teleport", "volume")
                      if Candidate(o) in self.pilots), None)  # fmt: skip
         chain = self.of_reference(plain or near or self.pilots[self.reference])
         if not k:

@@ -202,10 +202,17 @@ class Pilot:
         noise = (self.noise()[: len(both)] + other.noise()[: len(both)])[both] / mean**2  # of each half; as few samples
         # may not have shown it yet
         unsure = float(np.linalg.norm(noise)) / n
-        error = max(float(product.std(ddof=1)) / math.sqrt(n), unsure)
         few = float(np.partition(product, -(n // FEW) - 1)[-(n // FEW) - 1 :].sum()) / max(float(product.sum()), 1e-12)
-        bias, bias_error = float(apart.mean()), float(apart.std(ddof=1)) / math.sqrt(n)
-        return Apart(bias, bias_error, float(product.mean()), error, unsure, min(few, 1.0))
+        few = min(max(few, 0.0), 1.0)
+        whole = float(product.var(ddof=1)) / n
+        own = min(whole, float((noise**2 + 2.0 * np.maximum(product, 0.0) * noise).sum()) / n**2)
+        # pixels that were not looked at may have more, the more so the fewer make most of it; none is left of all
+        left = 1.0 - n / (self.world.scene.camera.width * self.world.scene.camera.height)
+        error = math.sqrt(own + (whole - own) * left * (1.0 + few) ** 2)
+        all_of_it = float(apart.var(ddof=1)) / n
+        noisy = min(all_of_it, 0.5 * float(noise.mean()) / n)
+        bias, bias_error = float(apart.mean()), math.sqrt(noisy + (all_of_it - noisy) * left)
+        return Apart(bias, bias_error, float(product.mean()), max(error, unsure), unsure, few)
 
     def noise(self) -> np.ndarray:
         """Variance of the mean of each pixel in one half, the mean of its channels (n,)."""

@@ -36,6 +36,7 @@ LEAST_PILOTS = 2.0  # [s] for pilots, however long worlds take to build
 BUILDING = 0.4  # of the time, after which no more worlds are built that may want records for leaps
 TURN = 0.05  # of the time, that a sample of each pixel of the reference may take
 FIRST, OF_REFERENCE = 0.35, 0.4  # shares of the time for the first round, and of a round for the reference
+OF_CHAIN = 0.1  # of the time, that one with a few explicit grains is likely to get
 OUT = 2.0  # spreads below what is expected that an error must be within reach of what is asked for
 LEAPS = 2.0  # [l*] of thickness from which on records for leaps may have to be made, a second each
 MOST_FINALISTS = 4
@@ -45,7 +46,7 @@ BRIEF, MOST_CHECKS = 0.3, 3  # [s] that such a look takes at least, and how many
 WIDE, WIDEST = 16.0, 50.0  # [deg] of suns in pilots that are smaller in the picture, which single grains would hardly
 # ever meet, at least and at most
 UNFINISHED = 0.5  # [1] noise of pixels over their mean, above which single grains under small suns are but bright dots
-TAILED = 2.0  # times what noise makes of it, that the error bar of what is missed is where few pixels make most of it
+TAILED = 1.5  # times what noise makes of it, that the error bar of what is missed is where few pixels make most of it
 SOON = 0.5  # of `MEETINGS`, after the first round, that there will be enough of after the second
 ENOUGH = 4.0  # times `MEETINGS` that they are to be met in the time that the reference has
 NEAR = 3.0  # times as long as the best as a candidate may seem to take to be looked at again
@@ -383,6 +384,9 @@ class _Planning(Evidence):
         what is missed falls with their number is seen better than foreseen."""
         chain = next((c for c in self.pilots if LEVELS[c.level].traits.chains), None)
         if chain is None or self.dear or self.expected[chain.level].texture < self.target:
+            return
+        samples = OF_CHAIN * self.budget * self.threads / max(self.sample(), 1e-9)
+        if self.chance and samples * self.coverage / self.chance < MEETINGS:  # it would not be believed
             return
         self.add(chain._replace(explicit_grains=GRAINS[1]))
 
