@@ -140,7 +140,9 @@ class Evidence:
         unsure = part.square_error + LEAST**2
         alike = min((max(seen.square, 0.0) + unsure) / (max(part.square, 0.0) + unsure), 1.0)
         square = seen.square + alike * (whole.square - part.square)
-        return seen._replace(square=square, square_error=max(seen.square_error, alike * whole.square_error))
+        return seen._replace(
+            square=square, square_error=max(seen.square_error, alike * whole.square_error), few=whole.few
+        )
 
     @property
     def sparkle(self) -> float:

@@ -127,7 +127,9 @@ class Pilot:
             left = seconds - (self.busy - begun) / self.threads
             if left < took or self.clocks.wall() - began > LATE * seconds:
                 break
-            share = max(1, min(8 * share, int(0.7 * left / took), AT_ONCE // (len(self.pixels) - self.active)))
+            share = max(
+                1, min(8 * share, int(0.7 * left / max(took, 1e-9)), AT_ONCE // (len(self.pixels) - self.active))
+            )
         self.wall += self.clocks.wall() - began
 
     def _take(self, each: int) -> None:

@@ -101,7 +101,7 @@ def _of_blocks(plan: Plan) -> str | None:
     seconds = p.turn * plan.spp if plan.spp is not None else plan.able
     if seconds is None:
         seconds = p.seconds(plan.target)
-    if not p.error(seconds) > MEANINGFUL:
+    if not (seconds > 0.0 and p.error(seconds) > MEANINGFUL):
         return None
     return percent(p.error_of_blocks(seconds, plan.grain))
 
