@@ -464,6 +464,10 @@ def test_what_chains_miss_after_explicit_grains_is_alike(ball: tsdf.Table, monke
     assert own.value == pytest.approx(0.01, rel=0.1) and other.value == pytest.approx(0.01, rel=0.3)
     assert before[1].value < 0.3 * other.value and other.error > own.error
     assert run.predicted(Candidate("teleport-memory")).floor == before[0]
+    run.expected["teleport-memory"] = run.expected["teleport-memory"]._replace(bias=0.3)  # of a sign that nobody knows
+    monkeypatch.setattr(planner._Planning, "length", 50.0)
+    biased = run.predicted(Candidate("teleport-memory", 3))
+    assert biased.bias == 0.0 and biased.bias_error > 0.03 and biased.floor.value > 0.8 * biased.bias_error
 
 
 def test_plans_by_counts_can_be_made_again(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -167,7 +167,7 @@ class Evidence:
                 floor = beliefs.of_square(max(floor.value, LEAST), UNSURE, later.square, later.square_error)
                 bias, bias_error = beliefs.of_bias(max(bias_error, LEAST), later.bias, later.bias_error, bias)
             elif alike is not None:
-                square = alike.square - alike.bias**2 + bias**2
+                square = alike.square - alike.bias**2 + bias**2 + bias_error**2  # which may be of either sign
                 floor = beliefs.of_square(max(floor.value, LEAST), UNSURE, square, alike.square_error)
                 floor = floor._replace(error=math.hypot(floor.error, ALIKE * floor.value))
             base, known = fewer, True

@@ -36,6 +36,7 @@ LEAST_PILOTS = 2.0  # [s] for pilots, however long worlds take to build
 BUILDING = 0.4  # of the time, after which no more worlds are built that may want records for leaps
 TURN = 0.05  # of the time, that a sample of each pixel of the reference may take
 FIRST, OF_REFERENCE = 0.35, 0.4  # shares of the time for the first round, and of a round for the reference
+BEGUN = 0.02  # of the time, for how long the reference takes
 OF_CHAIN = 0.1  # of the time, that one with a few explicit grains is likely to get
 OUT = 2.0  # spreads below what is expected that an error must be within reach of what is asked for
 LEAPS = 2.0  # [l*] of thickness from which on records for leaps may have to be made, a second each
@@ -141,6 +142,7 @@ class _Planning(Evidence):
         self.places: dict[bool, Place] = {}
         self.packings: dict[bool, Packed] = {}
         self.wide = WIDE  # [deg] of suns in pilots, at least
+        self.real = 0.0  # `chance` of the suns of the picture
         self.dear = False  # whether single grains cannot be piloted
 
     def plan(self) -> Plan:
@@ -212,7 +214,8 @@ class _Planning(Evidence):
         if not self.stopped() and (bold := self.bolder_of(chosen)) is not None and self.add(bold):
             self.round(max(self.ends - self.spent, BRIEF), [chosen.candidate, bold], 0.0)
             found = self.predictions()
-            chosen = self.choose([p for p in found if p.candidate in (chosen.candidate, bold)])
+            plain, bolder = (next(p for p in found if p.candidate == one) for one in (chosen.candidate, bold))
+            chosen = bolder if bolder.safe_seconds(self.target) < plain.safe_seconds(self.target) else plain
         return chosen, found
 
     def bolder_of(self, chosen: Prediction) -> Candidate | None:
@@ -239,9 +242,9 @@ class _Planning(Evidence):
         self.footprint, self.coverage, self.ratio = prior.looks(world)
         self.far = self.ratio > FEWER
         if world.lights.sampled and self.bodies:
-            self.chance = kurtosis_of(world.lights)
+            self.real = self.chance = kurtosis_of(world.lights)
             self.atoms = max(float(table.p_theta[0] + table.p_theta[-1]) for table in self.tables)
-            self.widen()
+            self.widen(self.sample())
         self.expected = {level: self.foreseen(level) for level in LEVELS}
         if not all(one.known for one in self.expected.values()):
             self.notes.append(
@@ -250,22 +253,24 @@ class _Planning(Evidence):
             )
         self.spent += self.clocks.process() - began
 
-    def widen(self) -> None:
-        """Have pilots look at suns that single grains meet often enough to tell what other levels miss."""
-        samples = OF_REFERENCE * self.budget * self.threads / max(self.sample(), 1e-9)
+    def widen(self, sample: float) -> bool:
+        """Have pilots look at suns that single grains meet often enough to tell what other levels miss, where a sample
+        takes one thread so long [s]; return whether that changes any."""
+        samples = OF_REFERENCE * self.budget * self.threads / max(sample, 1e-9)
         share = ENOUGH * MEETINGS / max(samples * self.coverage, 1e-9)  # of the sphere
-        self.wide = min(max(WIDE, math.degrees(4.0 * math.asin(math.sqrt(min(share, 1.0))))), WIDEST)
+        wide = min(max(WIDE, math.degrees(4.0 * math.asin(math.sqrt(min(share, 1.0))))), WIDEST)
         lights = tuple(
-            replace(light, angular_diameter_deg=self.wide)
-            if isinstance(light, SunLight) and light.angular_diameter_deg < self.wide
+            replace(light, angular_diameter_deg=wide)
+            if isinstance(light, SunLight) and light.angular_diameter_deg < wide
             else light
-            for light in self.scene.lights
+            for light in self.asked.lights
         )
-        if lights == self.scene.lights:
-            return
-        self.scene = replace(self.scene, lights=lights)
-        wide = kurtosis_of(build(self.scene, "volume", leap=0.0, places=self.places).lights)
-        self.rarer, self.chance = max(self.chance / wide, 1.0), wide
+        if lights == self.scene.lights or wide < self.wide:
+            return False
+        self.wide, self.scene = wide, replace(self.scene, lights=lights)
+        self.chance = kurtosis_of(build(self.scene, "volume", leap=0.0, places=self.places).lights)
+        self.rarer = max(self.real / self.chance, 1.0)
+        return True
 
     def foreseen(self, level: str) -> prior.Expected:
         """Return what is expected of a level, of the medium of which most is."""
@@ -342,10 +347,20 @@ class _Planning(Evidence):
             if self.add(Candidate(level)):
                 self.reference = Candidate(level)
                 break
+        self.time_the_reference()
         if self.reference is None:
             raise next(iter(self.impossible.values()))
         if self.reference.level != "explicit" and "explicit" in self.impossible:
             self.notes.append(f"no level explicit here, {self.reference} stands for it: {self.impossible['explicit']}")
+
+    def time_the_reference(self) -> None:
+        """See what a sample of single grains takes, and widen suns anew if that is more than was thought."""
+        if self.reference is None or not singly(self.reference) or not self.chance or self.wide >= WIDEST:
+            return
+        self.round(BEGUN * self.budget, [self.reference])
+        if self.widen(self.pilots[self.reference].seen.seconds):
+            self.pilots.clear()
+            self.add(self.reference)
 
     def refer_anew(self, share: float = 1.0) -> None:
         """Hold levels against the best that aims at lights, where the pilot of the best has met them too seldom, or
