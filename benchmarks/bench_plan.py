@@ -38,6 +38,7 @@ from tsdf.walk.geometry import Place
 THREADS = min(2, os.cpu_count() or 1)
 GRAINS = (0, 3, 8, 16)
 SHIFTS = (0.0, -2.0, -1.0, 1.0, 2.0)  # standard errors
+NOTHING = 1e-9  # [1] of variance of a sample: clear grains before a white sky
 SEEN = 2.0  # standard errors from which on a floor counts as measured
 LEAST = 0.005  # [1] floors below are not told apart
 ROUNDS, ROUND_S = 3, 0.15  # of timing, and what each candidate gets in each [s]
@@ -247,6 +248,9 @@ def main() -> None:
             plans = [(target, plan(scene, target, threads=THREADS)) for target in targets]
             kept = args.kept / f"{name.replace(' ', '_').replace(':', '')}.json" if args.kept else None
             found = measured(scene, args.truth, args.each, {one.chosen.candidate for _, one in plans}, kept)
+            if found[Candidate("explicit")].variance < NOTHING:
+                print(f"{name}: a picture without noise, by whatever level", flush=True)
+                continue
             for target, one in plans:
                 row = {"scene": name, **judged(one, found, target)}
                 rows.append(row)

@@ -506,6 +506,25 @@ def test_suns_that_are_met_too_seldom_are_wider_in_pilots(ball: tsdf.Table) -> N
         assert (size > 20.0) == wider == (run.rarer > 1.0) and size <= planner.WIDEST
 
 
+def test_suns_are_as_wide_as_what_samples_take_asks(ball: tsdf.Table) -> None:
+    """Where a sample of single grains takes longer than was thought, they are widened once more before anything is
+    piloted, and all pilots are under the same; where it takes as long, they stay."""
+    for thought, again in ((1e-9, True), (1e-3, False)):
+        scene = replace(pile(ball, 160.0), lights=(SUN, LIGHTS[0]))
+        run = planner._Planning(scene, 0.05, None, 0, 2)
+        run.budget, run.clocks = 0.3, counted()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(planner._Planning, "sample", lambda _, thought=thought: thought)
+            run.look()
+        before = run.wide
+        run.refer()
+        assert (run.wide > before) == again and before == (planner.WIDE if again else planner.WIDEST)
+        assert [*run.pilots] == [run.reference] == [Candidate("explicit")]
+        lights = run.pilots[Candidate("explicit")].world.scene.lights
+        (size,) = (light.angular_diameter_deg for light in lights if isinstance(light, SunLight))
+        assert size == run.wide and run.rarer == pytest.approx((size / 0.53) ** 2, rel=0.1)
+
+
 def test_geometry_is_made_once(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where grains lie wholly inside, it is the same with single grains and without; where only centres, it is not."""
     for inside, times in (("grains", 1), ("centres", 2)):
