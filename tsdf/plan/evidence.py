@@ -27,6 +27,7 @@ UNSURE = 0.8  # of the logarithm of texture, what that law may be off by for oth
 FADING = 0.3  # of the logarithm of texture, what that law may be off by; and of what is left of a bias
 SLOWEST, FASTEST = 0.1, 3.0  # of the logarithm of texture, that an explicit grain may be seen to take off
 SLANTED = 1.3  # times as long as a layer is thick, that light crosses it
+BOUND = 0.4  # of what smaller suns add to the square of texture, that this is known to
 MIRRORED = 0.2  # of a sun's radiance, that is in a glint, about
 RESOLVED = 3.0  # times what noise makes of it, from which on it is asked who makes a square
 USUAL = 0.15  # of a square, that a fiftieth of the pixels make, of numbers that are normal
@@ -113,7 +114,8 @@ class Evidence:
             return None
         seen, more = self.elsewhere(candidate, own.apart(other)), self.sparkle
         error = seen.square_error if candidate.explicit_grains else math.hypot(seen.square_error, self.unseen())
-        return seen._replace(square=more * seen.square, square_error=more * error)
+        bound = BOUND * (more - 1.0) * max(seen.square, 0.0)  # not all of it is glints, so this is rather too much
+        return seen._replace(square=more * seen.square, square_error=math.hypot(more * error, bound))
 
     def unseen(self) -> float:
         """Return the square of texture that glints of flat facets may make which no pilot has met: one, of a facet that
