@@ -283,6 +283,7 @@ def test_auto_in_python(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> No
     assert choice.plan is not None and (choice.spp, choice.target_error) == (3, None)
     found = choice.scene.render
     monkeypatch.setattr(shot, "plan", lambda *_: choice.plan)
+    assert choice.world().place is choice.plan.places[True]  # made once, for all pilots and the picture
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("warnings.warn", lambda *_, **__: None)
         one = tsdf.render(scene, spp=3, threads=1)

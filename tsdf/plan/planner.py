@@ -178,6 +178,7 @@ class _Planning(Evidence):
             self.asked, self.target, self.limit if self.said or beyond else None, (chosen, *rest), far, (),
             tuple(lacking), tuple(self.notes), self.spent, self.clocks.wall() - began, self.threads, self.load,
             self.spp, self.drowned(chosen, rest) if beyond else 0.0, 2.0 / max(self.footprint, 1e-6),
+            self.places, self.packings,
         )  # fmt: skip
         return replace(made, why=why(made, self.bodies, self.footprint, self.coverage, str(self.reference)))
 

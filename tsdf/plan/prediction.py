@@ -1,11 +1,13 @@
 """Predictions of candidates, and the plan that takes one of them."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from tsdf.plan.beliefs import Belief
 from tsdf.scene.scene import Scene
 from tsdf.study.candidates import Candidate, taken
+from tsdf.walk.explicit import Packed
+from tsdf.walk.geometry import Place
 
 TIE = 1.1  # times as long as the cheapest as it may take, of those the one with the least error is taken
 
@@ -110,6 +112,8 @@ class Plan:
         their glints [s]; 0 where none are.
     grain : float
         How many pixels a grain looks across, about.
+    places, packings : dict
+        Geometry and packed grains of the scene as far as they were made, for `tsdf.picture.world.build`.
     """
 
     scene: Scene
@@ -127,6 +131,8 @@ class Plan:
     spp: int | None = None
     glints: float = 0.0
     grain: float = 1.0
+    places: dict[bool, Place] = field(default_factory=dict)
+    packings: dict[bool, Packed] = field(default_factory=dict)
 
     @property
     def chosen(self) -> Prediction:
