@@ -103,6 +103,10 @@ class Measured:
         square = max(self.square + shift * self.square_error, 0.0)
         return math.sqrt(square + self.variance * self.turn / seconds)
 
+    def known(self, target: float) -> bool:
+        """Return whether the time to an error, or that it is out of reach, is known to a fifth."""
+        return self.square_error < 0.2 * abs(target**2 - max(self.square, 0.0))
+
     def seconds(self, target: float, shift: float = 0.0) -> float:
         left = target**2 - max(self.square + shift * self.square_error, 0.0)
         return self.variance * self.turn / left if left > 0.0 else math.inf
@@ -206,7 +210,7 @@ def judged(made: Plan, found: dict[Candidate, Measured], target: float) -> dict[
     mine = takes[chosen.candidate] if own is not None else math.nan
     return {
         "target": target, "chosen": str(chosen.candidate), "best": str(best), "takes": mine, "best_takes": takes[best],
-        "told": max(found[best].square_error, own.square_error if own else 0.0) < target**2,
+        "told": all(m.known(target) for m in (found[best], own) if m is not None),
         "over": mine / takes[best], "over_at_least": low.get(chosen.candidate, math.nan) / min(high.values()),
         "errors": ratios, "near": near, "floors": floors, "costs": turns, "planning": made.spent, "why": list(made.why),
     }  # fmt: skip
@@ -301,7 +305,7 @@ def summary(rows: list[dict[str, Any]]) -> None:
         )
         known = [row for row in some if row["told"]]
         right = sum(row["over"] <= 1.2 for row in known)
-        print(f"{title}: where errors of both are known to less than the target: {right} of {len(known)}")
+        print(f"{title}: where times of both are known to a fifth: {right} of {len(known)}")
         close = sum(row["over_at_least"] <= 1.2 for row in some)
         share = 100.0 * close / len(some)
         print(f"{title}: or not told from that by what is measured: {close} of {len(some)} ({share:.0f} %)")
