@@ -115,7 +115,9 @@ class Evidence:
         seen, more = self.elsewhere(candidate, own.apart(other)), self.sparkle
         error = seen.square_error if candidate.explicit_grains else math.hypot(seen.square_error, self.unseen())
         bound = BOUND * (more - 1.0) * max(seen.square, 0.0)  # not all of it is glints, so this is rather too much
-        return seen._replace(square=more * seen.square, square_error=math.hypot(more * error, bound))
+        # which facets mirror the real sun, of those that mirror a wider one, is chance, in a picture of few most of all
+        luck = math.sqrt((more - 1.0) * more**2 * seen.fourth / self.pixels)
+        return seen._replace(square=more * seen.square, square_error=math.hypot(more * error, bound, luck))
 
     def unseen(self) -> float:
         """Return the square of texture that glints of flat facets may make which no pilot has met: one, of a facet that

@@ -54,7 +54,7 @@ class Seen(NamedTuple):
 class Apart(NamedTuple):
     """How a pilot differs from another: of the mean, and the mean of the squared difference of pixels, without noise;
     over the other's mean [1], with standard errors, and what noise alone makes of the last of these. Of the square, the
-    share that one pixel in `FEW` makes of which it is most."""
+    share that one pixel in `FEW` makes of which it is most, and the mean of its own square."""
 
     bias: float
     bias_error: float
@@ -62,6 +62,7 @@ class Apart(NamedTuple):
     square_error: float
     noise: float = 0.0
     few: float = 0.0
+    fourth: float = 0.0
 
 
 class Pilot:
@@ -214,7 +215,8 @@ class Pilot:
         all_of_it = float(apart.var(ddof=1)) / n
         noisy = min(all_of_it, 0.5 * float(noise.mean()) / n)
         bias, bias_error = float(apart.mean()), math.sqrt(noisy + (all_of_it - noisy) * left)
-        return Apart(bias, bias_error, float(product.mean()), max(error, unsure), unsure, few)
+        fourth = float((product**2).mean())
+        return Apart(bias, bias_error, float(product.mean()), max(error, unsure), unsure, few, fourth)
 
     def noise(self) -> np.ndarray:
         """Variance of the mean of each pixel in one half, the mean of its channels (n,)."""
