@@ -11,6 +11,7 @@ from tsdf.cli.common import (
     Tool,
     check_numbers,
     check_output,
+    interrupt_status,
     plain,
     say,
     seed_option,
@@ -39,13 +40,13 @@ from tsdf.cli.common import (
 def main(
     scene: Path, target: float, seconds: float | None, seed: int | None, width: int | None, as_json: bool,
     out: Path | None, threads: int | None, quiet: bool,
-) -> None:  # fmt: skip
+) -> int:  # fmt: skip
     """Predict for SCENE, a TOML file, what each level costs and gets wrong, and say which to take.
 
     It renders a few pixels at each level that may do, for 5 seconds in all, or a tenth of --seconds if that is more, 20
     at most, of processors that have nothing else to do; machine code that is made for the first time comes on top, and
-    so do packings and records where they leave less than 2 seconds. tsdf-render without a level does the same and
-    renders what is chosen.
+    so do packings and records where they leave less than 2 seconds. An interrupt after the first look at all levels
+    ends it with what is known by then. tsdf-render without a level does the same and renders what is chosen.
     """
     from tsdf.errors import UsageError
     from tsdf.plan.planner import checked_target
@@ -65,7 +66,7 @@ def main(
     if out is not None:
         check_output(out, scene, *files_of(read))
     with working(quiet) as work:
-        plan = planner.plan(read, target, seconds, None, seed, threads, work.progress)
+        plan = planner.plan(read, target, seconds, None, seed, threads, work.told, work.stop)
     text = json.dumps(report.facts(plan), indent=1)
     if out is not None:
         write_text(out, text + "\n")
@@ -81,3 +82,4 @@ def main(
         for note in plan.notes:
             click.echo(f"note: {plain(note)}", err=True)
         click.echo(f"planned in {plan.spent:.1f} s of free processors, {plan.clock:.1f} s by the clock", err=True)
+    return interrupt_status() if work.stop.is_set() else 0

@@ -98,7 +98,7 @@ def main(
     if sum(stop is not None for stop in (spp, seconds, target_error)) > 1:
         raise UsageError("--spp, --seconds and --target-error each say when to stop: give one")
 
-    from tsdf.picture import leaping, render, world
+    from tsdf.picture import leaping, render
     from tsdf.plan import report, shot
     from tsdf.scene.scene import MAX_EXPLICIT, load, resized
     from tsdf.scene.specs import files_of
@@ -122,7 +122,7 @@ def main(
 
         work.progress(0.0, "reading the scene")
         choice = shot.chosen(read, level, spp, seconds, target_error, seed, threads, work.progress)
-        made = world.build(choice.scene, choice.scene.render.level, leap=leap, progress=work.progress)
+        made = choice.world(leap, work.progress)
         for note in (*(report.notes(choice.plan) if choice.plan else ()), *made.notes):
             work.progress.note(note)
         work.progress(0.0, "starting")

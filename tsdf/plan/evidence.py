@@ -15,6 +15,7 @@ from tsdf.plan.pilot import Apart, Pilot, Seen
 from tsdf.plan.prediction import Prediction
 from tsdf.scene.levels import LEVELS
 from tsdf.study.candidates import Candidate, candidates
+from tsdf.walk.lights import LUMINANCE
 
 GRAINS = (0, 3, 8, 16)  # explicit ones before a chain
 MEETINGS = 400.0  # of lights that are met by chance alone, that a pilot is believed from on: its mean, and what others
@@ -24,6 +25,12 @@ ALIKE = 0.2  # of the logarithm of an error, what two levels of teleportation ma
 LEAST = 1e-4  # [1] of an error
 UNSURE = 0.8  # of the logarithm of texture, what that law may be off by for other grains than spheres
 FADING = 0.3  # of the logarithm of texture, what that law may be off by; and of what is left of a bias
+SLOWEST, FASTEST = 0.1, 3.0  # of the logarithm of texture, that an explicit grain may be seen to take off
+SLANTED = 1.3  # times as long as a layer is thick, that light crosses it
+BOUND = 0.4  # of what smaller suns add to the square of texture, that this is known to
+MIRRORED = 0.2  # of a sun's radiance, that is in a glint, about
+RESOLVED = 3.0  # times what noise makes of it, from which on it is asked who makes a square
+USUAL = 0.15  # of a square, that a fiftieth of the pixels make, of numbers that are normal
 FLAT = 0.1  # share of light that goes straight on from which on grains are flat all over
 BOLD = 1.0  # [l*] least radius of leaps that are bolder than they are by default
 BOLD_BIAS = 0.006  # [1] that they may be off by (docs/leaps.md)
@@ -105,8 +112,41 @@ class Evidence:
             return None
         if not self.trusted(own) or not self.trusted(other):
             return None
-        seen, more = own.apart(other), self.sparkle
-        return seen._replace(square=more * seen.square, square_error=more * seen.square_error)
+        seen, more = self.elsewhere(candidate, own.apart(other)), self.sparkle
+        error = seen.square_error if candidate.explicit_grains else math.hypot(seen.square_error, self.unseen())
+        bound = BOUND * (more - 1.0) * max(seen.square, 0.0)  # not all of it is glints, so this is rather too much
+        # which facets mirror the real sun, of those that mirror a wider one, is chance, in a picture of few most of all
+        luck = math.sqrt((more - 1.0) * more**2 * seen.fourth / self.pixels)
+        return seen._replace(square=more * seen.square, square_error=math.hypot(more * error, bound, luck))
+
+    def unseen(self) -> float:
+        """Return the square of texture that glints of flat facets may make which no pilot has met: one, of a facet that
+        mirrors the brightest sun, as likely as it is that none of those that were looked at does."""
+        assert self.reference is not None
+        pilot = self.pilots[self.reference]
+        suns = pilot.world.lights.sun_radiance @ LUMINANCE
+        if self.atoms < FLAT or not self.chance or not len(suns) or not pilot.seen.mean > 0.0:
+            return 0.0
+        looked, each = int(pilot.looked.sum()), max(self.footprint**2, 1.0)  # pixels; facets in one, about
+        glint = MIRRORED * float(suns.max()) / pilot.seen.mean / each
+        return glint**2 / looked * math.exp(-0.5 * looked * each * self.coverage / self.chance)
+
+    def elsewhere(self, candidate: Candidate, seen: Apart) -> Apart:
+        """Return how a candidate without explicit grains differs from the reference, with what one that looked at more
+        pixels has found there: all miss the same glints."""
+        assert self.reference is not None
+        own, other = self.pilots[candidate], self.pilots[self.reference]
+        wide = [p for c, p in self.pilots.items() if not c.explicit_grains and p is not other]
+        best = max((p for p in wide if self.trusted(p)), key=lambda p: int(p.looked.sum()), default=own)
+        if candidate.explicit_grains or best.looked.sum() <= own.looked.sum():
+            return seen
+        whole, part = best.apart(other), best.apart(other, own)
+        unsure = part.square_error + LEAST**2
+        alike = min((max(seen.square, 0.0) + unsure) / (max(part.square, 0.0) + unsure), 1.0)
+        square = seen.square + alike * (whole.square - part.square)
+        return seen._replace(
+            square=square, square_error=max(seen.square_error, alike * whole.square_error), few=whole.few
+        )
 
     @property
     def sparkle(self) -> float:
@@ -131,7 +171,7 @@ class Evidence:
                 floor = beliefs.of_square(max(floor.value, LEAST), UNSURE, later.square, later.square_error)
                 bias, bias_error = beliefs.of_bias(max(bias_error, LEAST), later.bias, later.bias_error, bias)
             elif alike is not None:
-                square = alike.square - alike.bias**2 + bias**2
+                square = alike.square - alike.bias**2 + bias**2 + bias_error**2  # which may be of either sign
                 floor = beliefs.of_square(max(floor.value, LEAST), UNSURE, square, alike.square_error)
                 floor = floor._replace(error=math.hypot(floor.error, ALIKE * floor.value))
             base, known = fewer, True
@@ -200,9 +240,15 @@ class Evidence:
         """Return the candidate without single grains whose pilot says most of the texture that it misses."""
         alike = [c for c in self.pilots if not c.explicit_grains and not LEVELS[c.level].traits.packed]
         seen = {c: apart for c in alike if (apart := self.apart(c)) is not None}
-        # by the error of texture squared, not by its value: the least of several values is too small
+        # by the error of texture squared, not by its value: the least of several values is too small; and of few pixels
+        # neither is known
         return min(
-            seen, key=lambda c: math.hypot(seen[c].square_error, 2.0 * seen[c].bias * seen[c].bias_error), default=None
+            seen,
+            key=lambda c: (
+                -int(self.pilots[c].looked.sum()),
+                math.hypot(seen[c].square_error, 2.0 * seen[c].bias * seen[c].bias_error),
+            ),
+            default=None,
         )
 
     def rougher(self) -> float:
@@ -242,7 +288,10 @@ class Evidence:
         if k == before:
             return bias, bias_error, floor
         off = min(math.hypot(bias, bias_error), floor.value)
-        left = math.exp((before - k) * max(1.0 / self.per_e, self.lasting))
+        # light that a few bright paths bring does not get weaker with the grains that it has met, but rarer
+        lasting = self.lasting * (1.0 - 0.5 * self.glinting)
+        rate = max(1.0 / self.per_e, lasting)
+        left = math.exp((before - k) * (self.fading or rate if before else rate))
         if self.far and not before:
             left = min(1.0, self.ratio * left)
         packing, alike = self.of_one_packing(one), math.exp((before - k) * self.lasting)
@@ -255,6 +304,29 @@ class Evidence:
         return bias, bias_error, Belief(value, math.hypot(unsure, 0.5 * min(bias_error, value)))
 
     @property
+    def glinting(self) -> float:
+        """Which share of the square of what levels miss a few pixels make, beyond what they do of any texture [1]."""
+        best = self.best_known()
+        seen = self.apart(best) if best is not None else None
+        if seen is None or not seen.square > RESOLVED * self.sparkle * seen.noise:
+            return 0.0
+        return max(seen.few - USUAL, 0.0) / (1.0 - USUAL)
+
+    @property
+    def fading(self) -> float | None:
+        """Of the logarithm of texture, what each explicit grain takes off, as far as pilots with the first of them and
+        without any saw."""
+        few, best = GRAINS[1], self.best_known()
+        seen = self.seen_after(few)
+        if seen is None or best is None:
+            return None
+        square = seen.square - seen.bias**2
+        if not square > 2.0 * seen.square_error:
+            return None
+        less = self.texture_of(best).value * (self.ratio if self.far else 1.0) / math.sqrt(square)
+        return min(max(math.log(less) / few, SLOWEST), FASTEST)
+
+    @property
     def per_e(self) -> float:
         """How many grains bring texture down by e: spheres 4 (docs/hybrid.md), facets as many as forget a direction."""
         forget = [max(LEAST_PER_E, 1.0 / max(1.0 - body.mean_cosine, 1e-9)) for body in self.bodies if not body.round]
@@ -264,7 +336,16 @@ class Evidence:
     def length(self) -> float:
         """How many grains light meets that meets any, by the reference: with fewer still to come less can be missed."""
         assert self.reference is not None
-        return max(self.pilots[self.reference].seen.events / max(self.coverage, 1e-9), 1.0)
+        return max(self.pilots[self.reference].seen.events / max(self.coverage * self.struck, 1e-9), 1.0)
+
+    @property
+    def struck(self) -> float:
+        """Share of the light that meets any grain of that which comes into the medium of which most is, about."""
+        struck = 1.0
+        for body in self.bodies:  # transport mean free paths are mean free paths over 1 - g
+            layer = max(body.thickness - 2.0 * body.whole, 0.5) / max(1.0 - body.mean_cosine, 1e-9)
+            struck = min(struck, -math.expm1(-SLANTED * layer / body.transport))
+        return struck
 
     @property
     def lasting(self) -> float:
@@ -303,7 +384,8 @@ class Evidence:
         if level == "explicit":
             return best._replace(seconds=self.explicit_sample), False
         plain = self.pilots.get(Candidate(level))
-        near = next((self.pilots[Candidate(o)] for o in ("teleport-memory", "teleport", "volume")
+        alike = ("volume-hg", "isotropic") if LEVELS[level].traits.points else ()  # whose light all aims
+        near = next((self.pilots[Candidate(o)] for o in (*alike, "teleport-memory", "teleport", "volume")
                      if Candidate(o) in self.pilots), None)  # fmt: skip
         chain = self.of_reference(plain or near or self.pilots[self.reference])
         if not k:

@@ -8,6 +8,7 @@ in one and in the other is, in the mean, the difference squared without its nois
 import math
 import os
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -18,9 +19,26 @@ from tsdf.picture.world import World, camera_of
 from tsdf.walk import transport
 
 PIXELS, FEWEST = 484, 64  # looked at, at most, and where samples are dear
+MORE = 1936  # looked at where few pixels make most of a difference
+FREE = 0.25  # quantile of times that stands for a processor that has nothing else to do
+FEW = 50  # one pixel in so many may make most of a difference
 LATE = 6.0  # times what is asked for that it may take on the clock, where processors are busy with other things
 HALVES = 2
 AT_ONCE = 1 << 15  # samples of a thread at once, at most
+
+
+class Clocks(NamedTuple):
+    """What time is read from.
+
+    thread: of one thread that has these walkers [s]; process: of all threads [s]; wall: on the clock [s].
+    """
+
+    thread: Callable[[Walkers], float] = lambda _: time.thread_time()
+    process: Callable[[], float] = time.process_time
+    wall: Callable[[], float] = time.perf_counter
+
+
+CLOCKS = Clocks()
 
 
 class Seen(NamedTuple):
@@ -35,12 +53,16 @@ class Seen(NamedTuple):
 
 class Apart(NamedTuple):
     """How a pilot differs from another: of the mean, and the mean of the squared difference of pixels, without noise;
-    over the other's mean [1], with standard errors."""
+    over the other's mean [1], with standard errors, and what noise alone makes of the last of these. Of the square, the
+    share that one pixel in `FEW` makes of which it is most, and the mean of its own square."""
 
     bias: float
     bias_error: float
     square: float
     square_error: float
+    noise: float = 0.0
+    few: float = 0.0
+    fourth: float = 0.0
 
 
 class Pilot:
@@ -51,18 +73,40 @@ class Pilot:
     world : World
     pixels : (n,) int64
         Numbers of the pixels.
+    counts : (n,) int64
+        Samples of each in each half.
     """
 
-    def __init__(self, world: World, seed: int = 0, threads: int | None = None, pixels: int = PIXELS) -> None:
-        self.world, self.seed, self.threads = world, seed, threads or os.cpu_count() or 1
+    def __init__(
+        self, world: World, seed: int = 0, threads: int | None = None, pixels: int = PIXELS, clocks: Clocks = CLOCKS
+    ) -> None:
+        self.world, self.seed, self.threads, self.clocks = world, seed, threads or os.cpu_count() or 1, clocks
         camera = world.scene.camera
         self.pixels = spread(camera.width, camera.height, pixels, seed)
         n = len(self.pixels)
         self.sums, self.squares = np.zeros((HALVES, n, 3)), np.zeros((HALVES, n, 3))
-        self.each = 0  # samples of a pixel in each half
+        self.counts, self.active = np.zeros(n, np.int64), 0  # the first of those that samples are taken of now
         self.busy, self.wall = 0.0, 0.0  # [s] of all threads together; on the clock
-        self.timed, self.timed_samples, self.largest = 0.0, 0, 0  # [s] of the largest portions, whose start is no part
+        self.times: list[float] = []  # [s] a sample, of the largest portions, whose start is no part
+        self.largest = 0  # of them, samples
         self._walkers: list[Walkers] = []
+
+    @property
+    def each(self) -> int:
+        """Samples of a pixel in each half, of the first of them."""
+        return int(self.counts[0])
+
+    def look_wider(self, pixels: int) -> None:
+        """Have samples be taken of about so many pixels from here on, none of which it has looked at."""
+        camera = self.world.scene.camera
+        more = np.setdiff1d(spread(camera.width, camera.height, pixels, self.seed + 1), self.pixels)
+        if not len(more):
+            return
+        old = len(self.pixels) if self.each else 0
+        fresh = np.zeros((HALVES, len(more), 3))
+        self.pixels, self.active = np.concatenate((self.pixels, more)), old
+        self.sums, self.squares = (np.concatenate((own, fresh), axis=1) for own in (self.sums, self.squares))
+        self.counts = np.concatenate((self.counts, np.zeros(len(more), np.int64)))
 
     def warm(self) -> None:
         """Follow one sample, so that everything is compiled."""
@@ -72,81 +116,114 @@ class Pilot:
             for one in self._walkers:
                 one.counters[:] = 0
 
-    def run(self, seconds: float) -> None:
-        """Take samples for about so long [s]: of each thread, on processors that have nothing else to do."""
+    def run(self, seconds: float, stopped: Callable[[], bool] = lambda: False) -> None:
+        """Take samples for about so long [s], or until stopped: of each thread, on processors that have nothing else
+        to do."""
         self.warm()
-        began, begun, share = time.perf_counter(), self.busy, 1
-        while True:
+        began, begun, share = self.clocks.wall(), self.busy, 1
+        while not stopped():
             before = self.busy
             self._take(share)
             took = (self.busy - before) / self.threads / share
             left = seconds - (self.busy - begun) / self.threads
-            if left < took or time.perf_counter() - began > LATE * seconds:
+            if left < took or self.clocks.wall() - began > LATE * seconds:
                 break
-            share = max(1, min(8 * share, int(0.7 * left / took), AT_ONCE // len(self.pixels)))
-        self.wall += time.perf_counter() - began
+            share = max(
+                1, min(8 * share, int(0.7 * left / max(took, 1e-9)), AT_ONCE // (len(self.pixels) - self.active))
+            )
+        self.wall += self.clocks.wall() - began
 
     def _take(self, each: int) -> None:
-        """Take so many samples of each pixel, in each half, for each thread."""
+        """Take so many samples of each pixel that is active, in each half, for each thread."""
         camera = camera_of(self.world)
         jobs = [(h, k) for k in range(self.threads) for h in range(HALVES)]
-        free = list(self._walkers)
+        free, active = list(self._walkers), self.pixels[self.active :]
+        done = int(self.counts[self.active])
 
         def work(job: tuple[int, int]) -> tuple[int, np.ndarray, float]:
             half, k = job
-            mine, began = free.pop(), time.thread_time()
-            first = HALVES * (self.each + k * each) + half * each  # halves share no sample
-            radiance = followed(mine, camera, self.pixels, each, first, self.seed, self.world.met)
-            spent = time.thread_time() - began
+            mine = free.pop()
+            began = self.clocks.thread(mine)
+            first = HALVES * (done + k * each) + half * each  # halves share no sample
+            radiance = followed(mine, camera, active, each, first, self.seed, self.world.met)
+            spent = self.clocks.thread(mine) - began
             free.append(mine)
             return half, radiance, spent
 
-        if each > 2 * self.largest:
-            self.timed, self.timed_samples, self.largest = 0.0, 0, each
+        size = each * len(active)
+        if size > 2 * self.largest:
+            self.times, self.largest = [], size
         with ThreadPoolExecutor(self.threads) as pool:
             for half, radiance, spent in pool.map(work, jobs):
-                self.sums[half] += radiance.sum(axis=1)
-                self.squares[half] += (radiance**2).sum(axis=1)
+                self.sums[half, self.active :] += radiance.sum(axis=1)
+                self.squares[half, self.active :] += (radiance**2).sum(axis=1)
                 self.busy += spent
-                if 2 * each > self.largest:
-                    self.timed, self.timed_samples = self.timed + spent, self.timed_samples + radiance[..., 0].size
-        self.each += self.threads * each
+                if 2 * size > self.largest:
+                    self.times.append(spent / size)
+        self.counts[self.active :] += self.threads * each
+
+    @property
+    def looked(self) -> np.ndarray:
+        """Which pixels have samples (n,)."""
+        return self.counts > 0
 
     @property
     def seen(self) -> Seen:
         """What it saw so far."""
-        n, count = len(self.pixels), HALVES * self.each
-        total, squares = self.sums.sum(axis=0), self.squares.sum(axis=0)
-        mean = float(total.mean()) / max(count, 1)
-        events, each = sum(int(one.counters[0]) for one in self._walkers), self.timed / max(self.timed_samples, 1)
-        met = events / max(count * n, 1)
+        seen = self.looked
+        count, samples = HALVES * self.counts[seen][:, None], HALVES * int(self.counts.sum())
+        # other work on the machine only adds to it
+        each, met = float(np.quantile(self.times or [0.0], FREE)), self.events / max(samples, 1)
+        if not samples:
+            return Seen(0.0, math.inf, each, met, 0)
+        means, squares = self.sums.sum(axis=0)[seen] / count, self.squares.sum(axis=0)[seen] / count
+        mean = float(means.mean())
         if not mean > 0.0:
-            return Seen(0.0, math.inf, each, met, count * n)
-        variance = np.maximum(squares / count - (total / count) ** 2, 0.0) * count / max(count - 1, 1)
-        grey = float(variance.mean())
-        return Seen(mean, grey / mean / mean, each, met, count * n)
+            return Seen(0.0, math.inf, each, met, samples)
+        variance = np.maximum(squares - means**2, 0.0) * count / np.maximum(count - 1, 1)
+        return Seen(mean, float(variance.mean()) / mean / mean, each, met, samples)
+
+    @property
+    def events(self) -> int:
+        """Grains met by all samples."""
+        return sum(int(one.counters[0]) for one in self._walkers)
 
     def pixel_means(self, half: int) -> np.ndarray:
         """Mean radiance of each pixel (n, 3) in one half."""
-        means: np.ndarray = self.sums[half] / max(self.each, 1)
+        means: np.ndarray = self.sums[half] / np.maximum(self.counts, 1)[:, None]
         return means
 
-    def apart(self, other: "Pilot") -> Apart:
-        """Return how it differs from another of the same picture, which is not black."""
-        mean = other.seen.mean
-        one, two = ((self.pixel_means(h) - other.pixel_means(h)) / mean for h in range(HALVES))
-        both, product = 0.5 * (one + two).mean(axis=1), (one * two).mean(axis=1)
-        n = len(self.pixels)
-        noise = (self.noise() + other.noise()) / mean**2  # of each half; as few samples may not have shown it yet
-        error = max(float(product.std(ddof=1)) / math.sqrt(n), float(np.linalg.norm(noise)) / n)
-        return Apart(float(both.mean()), float(both.std(ddof=1)) / math.sqrt(n), float(product.mean()), error)
+    def apart(self, other: "Pilot", within: "Pilot | None" = None) -> Apart:
+        """Return how it differs from another of the same picture, which is not black, in pixels that both looked at, or
+        a third as well."""
+        mean, n = other.seen.mean, min(len(one.pixels) for one in (self, other, within or self))
+        both = np.logical_and.reduce([one.looked[:n] for one in (self, other, within or self)])
+        n = int(both.sum())
+        one, two = (((self.pixel_means(h)[: len(both)] - other.pixel_means(h)[: len(both)]) / mean)[both]
+                    for h in range(HALVES))  # fmt: skip
+        apart, product = 0.5 * (one + two).mean(axis=1), (one * two).mean(axis=1)
+        noise = (self.noise()[: len(both)] + other.noise()[: len(both)])[both] / mean**2  # of each half; as few samples
+        # may not have shown it yet
+        unsure = float(np.linalg.norm(noise)) / n
+        few = float(np.partition(product, -(n // FEW) - 1)[-(n // FEW) - 1 :].sum()) / max(float(product.sum()), 1e-12)
+        few = min(max(few, 0.0), 1.0)
+        whole = float(product.var(ddof=1)) / n
+        own = min(whole, float((noise**2 + 2.0 * np.maximum(product, 0.0) * noise).sum()) / n**2)
+        # pixels that were not looked at may have more, the more so the fewer make most of it; none is left of all
+        left = 1.0 - n / (self.world.scene.camera.width * self.world.scene.camera.height)
+        error = math.sqrt(own + (whole - own) * left * (1.0 + few) ** 2)
+        all_of_it = float(apart.var(ddof=1)) / n
+        noisy = min(all_of_it, 0.5 * float(noise.mean()) / n)
+        bias, bias_error = float(apart.mean()), math.sqrt(noisy + (all_of_it - noisy) * left)
+        fourth = float((product**2).mean())
+        return Apart(bias, bias_error, float(product.mean()), max(error, unsure), unsure, few, fourth)
 
     def noise(self) -> np.ndarray:
         """Variance of the mean of each pixel in one half, the mean of its channels (n,)."""
-        count = HALVES * self.each
+        count = HALVES * np.maximum(self.counts, 1)[:, None]
         mean = self.sums.sum(axis=0) / count
         variance = np.maximum(self.squares.sum(axis=0) / count - mean**2, 0.0)
-        noise: np.ndarray = variance.mean(axis=1) / max(self.each, 1)
+        noise: np.ndarray = variance.mean(axis=1) / np.maximum(self.counts, 1)
         return noise
 
 

@@ -6,9 +6,9 @@ What is expected of a scene is `prior`, what short renders of it show is `pilot`
 
 import math
 import os
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from threading import Event
 
 from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
@@ -17,7 +17,7 @@ from tsdf.picture.trust import kurtosis_of
 from tsdf.picture.world import World, build
 from tsdf.plan import needs, prior
 from tsdf.plan.evidence import BOLD, BOLD_BIAS, GRAINS, MEETINGS, Evidence, singly
-from tsdf.plan.pilot import FEWEST, HALVES, PIXELS, Pilot
+from tsdf.plan.pilot import CLOCKS, FEWEST, HALVES, MORE, PIXELS, Clocks, Pilot
 from tsdf.plan.prediction import TIE, Plan, Prediction
 from tsdf.plan.report import BUSY, digits, why
 from tsdf.scene.levels import LEVELS
@@ -27,7 +27,7 @@ from tsdf.scene.specs import SunLight
 from tsdf.spheres.packing import MAX as MOST_PACKED
 from tsdf.study.candidates import Candidate, candidates, taken
 from tsdf.walk.explicit import Packed, mesh_beside
-from tsdf.walk.geometry import Place
+from tsdf.walk.geometry import Place, place
 
 TARGET = 0.02  # [1] where nothing else is asked for
 LEAST_TARGET, MOST_TARGET = 1e-4, 1.0
@@ -36,6 +36,8 @@ LEAST_PILOTS = 2.0  # [s] for pilots, however long worlds take to build
 BUILDING = 0.4  # of the time, after which no more worlds are built that may want records for leaps
 TURN = 0.05  # of the time, that a sample of each pixel of the reference may take
 FIRST, OF_REFERENCE = 0.35, 0.4  # shares of the time for the first round, and of a round for the reference
+BEGUN = 0.02  # of the time, for how long the reference takes
+OF_CHAIN = 0.1  # of the time, that one with a few explicit grains is likely to get
 OUT = 2.0  # spreads below what is expected that an error must be within reach of what is asked for
 LEAPS = 2.0  # [l*] of thickness from which on records for leaps may have to be made, a second each
 MOST_FINALISTS = 4
@@ -45,6 +47,7 @@ BRIEF, MOST_CHECKS = 0.3, 3  # [s] that such a look takes at least, and how many
 WIDE, WIDEST = 16.0, 50.0  # [deg] of suns in pilots that are smaller in the picture, which single grains would hardly
 # ever meet, at least and at most
 UNFINISHED = 0.5  # [1] noise of pixels over their mean, above which single grains under small suns are but bright dots
+TAILED = 1.5  # times what noise makes of it, that the error bar of what is missed is where few pixels make most of it
 SOON = 0.5  # of `MEETINGS`, after the first round, that there will be enough of after the second
 ENOUGH = 4.0  # times `MEETINGS` that they are to be met in the time that the reference has
 NEAR = 3.0  # times as long as the best as a candidate may seem to take to be looked at again
@@ -70,7 +73,8 @@ def checked_target(target: float, name: str = "target") -> float:
 
 def plan(
     scene: Scene, target: float = TARGET, seconds: float | None = None, spp: int | None = None, seed: int | None = None,
-    threads: int | None = None, told: Callable[[float, str], None] | None = None,
+    threads: int | None = None, told: Callable[[float, str], None] | None = None, stop: Event | None = None,
+    clocks: Clocks | None = None,
 ) -> Plan:  # fmt: skip
     """Return how a scene is best rendered.
 
@@ -91,7 +95,11 @@ def plan(
     threads : int, optional
         All processors by default.
     told : callable, optional
-        Called with the share done and a word about it.
+        Called with the share done and a word about it; the share is above 0 from when something is known.
+    stop : Event, optional
+        Set by others to end early; the plan is then what is known so far.
+    clocks : Clocks, optional
+        What time is read from; others than the machine's make plans that can be made again to the last bit.
 
     Raises
     ------
@@ -104,7 +112,7 @@ def plan(
     if scene.render.explicit_grains:
         raise UsageError(f"{scene.name}: explicit_grains is what a plan chooses; leave it out, or name a level")
     run = _Planning(scene, target, seconds, scene.render.seed if seed is None else seed, threads or os.cpu_count() or 1)
-    run.spp = spp
+    run.spp, run.clocks, run.stop = spp, clocks or CLOCKS, stop or Event()
     run.told = told or (lambda share, word: None)
     return run.plan()
 
@@ -119,7 +127,7 @@ class _Planning(Evidence):
         self.said = seconds is not None and math.isfinite(seconds)  # whether that long is meant, and not at most
         self.told: Callable[[float, str], None] = lambda share, word: None
         self.scene, self.tables = loaded(scene)  # as pilots see it
-        self.looked_at = PIXELS
+        self.looked_at, self.wider = PIXELS, False
         self.named = [
             (str(spec.table), table)
             for spec, table in zip((g for m in scene.media for g in m.grains), self.tables, strict=True)
@@ -128,15 +136,18 @@ class _Planning(Evidence):
         self.notes: list[str] = []
         self.budget = max(SECONDS, min(SHARE * self.limit, MOST_SECONDS)) if self.said else SECONDS
         self.spp: int | None = None
-        self.spent, self.load, self.began = 0.0, 1.0, time.perf_counter()
+        self.clocks, self.stop = CLOCKS, Event()
+        self.spent, self.load, self.known = 0.0, 1.0, 0.0
         self.ends = self.budget  # of the time that is spent
         self.places: dict[bool, Place] = {}
         self.packings: dict[bool, Packed] = {}
         self.wide = WIDE  # [deg] of suns in pilots, at least
+        self.real = 0.0  # `chance` of the suns of the picture
         self.dear = False  # whether single grains cannot be piloted
 
     def plan(self) -> Plan:
         """Return the plan."""
+        began = self.clocks.wall()
         self.told(0.0, "planning")
         self.look()
         self.refer()
@@ -144,11 +155,15 @@ class _Planning(Evidence):
             if self.deep and self.spent > BUILDING * self.budget and len(self.pilots) > 2:
                 break
             self.add(Candidate(level))
+        self.look_deeper()
         left = max(self.budget - self.spent, LEAST_PILOTS)
         self.ends = self.spent + left
         self.round(FIRST * left, list(self.pilots))
+        self.known = FIRST
         self.refer_anew(SOON)
-        self.round((1.0 - FIRST - CHECK) * left, self.finalists())
+        glints = self.look_wider()
+        self.round((1.0 - FIRST - CHECK) * left, list(dict.fromkeys((*self.finalists(), *glints))))
+        self.known = 1.0 - CHECK
         self.refer_anew()
         self.weigh()
         chosen, found = self.settled()
@@ -161,17 +176,20 @@ class _Planning(Evidence):
         )  # fmt: skip
         made = Plan(
             self.asked, self.target, self.limit if self.said or beyond else None, (chosen, *rest), far, (),
-            tuple(lacking), tuple(self.notes), self.spent, time.perf_counter() - self.began, self.threads, self.load,
-            self.spp, beyond and self.drowned(chosen, rest),
+            tuple(lacking), tuple(self.notes), self.spent, self.clocks.wall() - began, self.threads, self.load,
+            self.spp, self.drowned(chosen, rest) if beyond else 0.0, 2.0 / max(self.footprint, 1e-6),
+            self.places, self.packings,
         )  # fmt: skip
         return replace(made, why=why(made, self.bodies, self.footprint, self.coverage, str(self.reference)))
 
-    def drowned(self, chosen: Prediction, others: Sequence[Prediction]) -> bool:
-        """Return whether single grains have less error than the chosen, but such that are left out as mostly noise."""
+    def drowned(self, chosen: Prediction, others: Sequence[Prediction]) -> float:
+        """Return from when on single grains are taken [s] that have less error than the chosen but are left out, as
+        mostly noise; 0 where there are none."""
         limit = self.limit / self.load
-        return any(
-            self.unfinished(p) and TIE * p.likely_error(limit) < chosen.likely_error(limit) for p in others
-        )  # fmt: skip
+        left_out = [
+            p for p in others if self.unfinished(p) and TIE * p.likely_error(limit) < chosen.likely_error(limit)
+        ]
+        return self.load * min((p.variance * p.turn / UNFINISHED**2 for p in left_out), default=0.0)
 
     def unfinished(self, p: Prediction) -> bool:
         """Return whether single grains under small suns are still but bright dots after the time that there is."""
@@ -181,7 +199,7 @@ class _Planning(Evidence):
         """Return what is chosen, which a pilot has seen where one can, and all predictions."""
         for looks in range(MOST_CHECKS):
             one = self.choose(self.predictions()).candidate
-            if one in self.pilots or (looks and self.spent > self.ends):
+            if one in self.pilots or (looks and self.spent > self.ends) or self.stopped():
                 break
             if self.dear and LEVELS[one.level].traits.packed:
                 if self.possible(one) is not None:
@@ -194,10 +212,11 @@ class _Planning(Evidence):
             p for p in found if p.candidate in self.pilots or (self.dear and LEVELS[p.candidate.level].traits.packed)
         ]
         chosen = self.choose(seen or found)
-        if (bold := self.bolder_of(chosen)) is not None and self.add(bold):
+        if not self.stopped() and (bold := self.bolder_of(chosen)) is not None and self.add(bold):
             self.round(max(self.ends - self.spent, BRIEF), [chosen.candidate, bold], 0.0)
             found = self.predictions()
-            chosen = self.choose([p for p in found if p.candidate in (chosen.candidate, bold)])
+            plain, bolder = (next(p for p in found if p.candidate == one) for one in (chosen.candidate, bold))
+            chosen = bolder if bolder.safe_seconds(self.target) < plain.safe_seconds(self.target) else plain
         return chosen, found
 
     def bolder_of(self, chosen: Prediction) -> Candidate | None:
@@ -216,39 +235,43 @@ class _Planning(Evidence):
 
     def look(self) -> None:
         """See how large grains look and what is expected of the levels."""
-        began = time.process_time()
+        began = self.clocks.process()
+        if all(medium.inside == "grains" for medium in self.scene.media):
+            self.places = dict.fromkeys((False, True), place(self.scene, grains=True))  # one for all levels
         world = build(self.scene, "volume", leap=0.0, places=self.places)
         self.bodies = prior.bodies(world, self.tables)
         self.footprint, self.coverage, self.ratio = prior.looks(world)
         self.far = self.ratio > FEWER
         if world.lights.sampled and self.bodies:
-            self.chance = kurtosis_of(world.lights)
+            self.real = self.chance = kurtosis_of(world.lights)
             self.atoms = max(float(table.p_theta[0] + table.p_theta[-1]) for table in self.tables)
-            self.widen()
+            self.widen(self.sample())
         self.expected = {level: self.foreseen(level) for level in LEVELS}
         if not all(one.known for one in self.expected.values()):
             self.notes.append(
                 "the scene lies outside the atlas of level errors: what no pilot has seen is known within a factor of "
                 f"{math.exp(2.0 * prior.SPREAD):.0f} only"
             )
-        self.spent += time.process_time() - began
+        self.spent += self.clocks.process() - began
 
-    def widen(self) -> None:
-        """Have pilots look at suns that single grains meet often enough to tell what other levels miss."""
-        samples = OF_REFERENCE * self.budget * self.threads / max(self.sample(), 1e-9)
+    def widen(self, sample: float) -> bool:
+        """Have pilots look at suns that single grains meet often enough to tell what other levels miss, where a sample
+        takes one thread so long [s]; return whether that changes any."""
+        samples = OF_REFERENCE * self.budget * self.threads / max(sample, 1e-9)
         share = ENOUGH * MEETINGS / max(samples * self.coverage, 1e-9)  # of the sphere
-        self.wide = min(max(WIDE, math.degrees(4.0 * math.asin(math.sqrt(min(share, 1.0))))), WIDEST)
+        wide = min(max(WIDE, math.degrees(4.0 * math.asin(math.sqrt(min(share, 1.0))))), WIDEST)
         lights = tuple(
-            replace(light, angular_diameter_deg=self.wide)
-            if isinstance(light, SunLight) and light.angular_diameter_deg < WIDE
+            replace(light, angular_diameter_deg=wide)
+            if isinstance(light, SunLight) and light.angular_diameter_deg < wide
             else light
-            for light in self.scene.lights
+            for light in self.asked.lights
         )
-        if lights == self.scene.lights:
-            return
-        self.scene = replace(self.scene, lights=lights)
-        wide = kurtosis_of(build(self.scene, "volume", leap=0.0, places=self.places).lights)
-        self.rarer, self.chance = max(self.chance / wide, 1.0), wide
+        if lights == self.scene.lights or wide < self.wide:
+            return False
+        self.wide, self.scene = wide, replace(self.scene, lights=lights)
+        self.chance = kurtosis_of(build(self.scene, "volume", leap=0.0, places=self.places).lights)
+        self.rarer = max(self.real / self.chance, 1.0)
+        return True
 
     def foreseen(self, level: str) -> prior.Expected:
         """Return what is expected of a level, of the medium of which most is."""
@@ -281,7 +304,13 @@ class _Planning(Evidence):
         try:
             scene = taken(self.scene, candidate)
             scene = replace(scene, render=replace(scene.render, fewer_far=self.far and candidate.explicit_grains > 0))
-            return build(scene, candidate.level, progress=self.told, places=self.places, packings=self.packings)
+            return build(
+                scene,
+                candidate.level,
+                progress=self.building,
+                places=self.places,
+                packings=self.packings,
+            )
         except (SceneError, UsageError) as error:
             if not candidate.explicit_grains:
                 self.impossible[candidate.level] = error
@@ -289,13 +318,15 @@ class _Planning(Evidence):
 
     def add(self, candidate: Candidate) -> bool:
         """Make a candidate ready for pilots, if it is possible; kernels are compiled outside the time."""
-        self.told(0.0, f"building {candidate}")
-        began = time.process_time()
+        self.told(self.known, f"building {candidate}")
+        began = self.clocks.process()
         world = self.possible(candidate)
-        self.spent += time.process_time() - began
+        self.spent += self.clocks.process() - began
         if world is None:
             return False
-        self.pilots[candidate] = Pilot(world, self.seed, self.threads, self.looked_at)
+        pilot = self.pilots[candidate] = Pilot(world, self.seed, self.threads, self.looked_at, self.clocks)
+        if self.wider:
+            pilot.look_wider(MORE)
         self.pilots[candidate].warm()
         return True
 
@@ -317,10 +348,20 @@ class _Planning(Evidence):
             if self.add(Candidate(level)):
                 self.reference = Candidate(level)
                 break
+        self.time_the_reference()
         if self.reference is None:
             raise next(iter(self.impossible.values()))
         if self.reference.level != "explicit" and "explicit" in self.impossible:
             self.notes.append(f"no level explicit here, {self.reference} stands for it: {self.impossible['explicit']}")
+
+    def time_the_reference(self) -> None:
+        """See what a sample of single grains takes, and widen suns anew if that is more than was thought."""
+        if self.reference is None or not singly(self.reference) or not self.chance or self.wide >= WIDEST:
+            return
+        self.round(BEGUN * self.budget, [self.reference])
+        if self.widen(self.pilots[self.reference].seen.seconds):
+            self.pilots.clear()
+            self.add(self.reference)
 
     def refer_anew(self, share: float = 1.0) -> None:
         """Hold levels against the best that aims at lights, where the pilot of the best has met them too seldom, or
@@ -354,6 +395,32 @@ class _Planning(Evidence):
 
     # ------------------------------------------------------------------------------------------------ rounds
 
+    def look_deeper(self) -> None:
+        """Have the best chain be piloted with a few explicit grains first, where it is likely to need some: how fast
+        what is missed falls with their number is seen better than foreseen."""
+        chain = next((c for c in self.pilots if LEVELS[c.level].traits.chains), None)
+        if chain is None or self.dear or self.expected[chain.level].texture < self.target:
+            return
+        samples = OF_CHAIN * self.budget * self.threads / max(self.sample(), 1e-9)
+        if self.chance and samples * self.coverage / self.chance < MEETINGS:  # it would not be believed
+            return
+        self.add(chain._replace(explicit_grains=GRAINS[1]))
+
+    def look_wider(self) -> list[Candidate]:
+        """Have pilots look at more pixels, where few of those that they looked at make most of what others miss: how
+        large that is so few cannot tell. Return what is to be piloted for it."""
+        best = self.best_known()
+        seen = self.apart(best) if best is not None and self.looked_at == PIXELS else None
+        if best is None or seen is None:
+            return []
+        if seen.square_error < TAILED * self.sparkle * seen.noise:
+            return []
+        self.wider = True
+        for one in {best, self.reference} | {c for c in self.pilots if c.explicit_grains}:
+            if one is not None:
+                self.pilots[one].look_wider(MORE)
+        return [best]
+
     def round(self, seconds: float, some: list[Candidate], of_reference: float = OF_REFERENCE) -> None:
         """Pilot some candidates for about so long in all [s], of which the reference gets a share."""
         rest = [one for one in some if one != self.reference]
@@ -361,11 +428,19 @@ class _Planning(Evidence):
         own = seconds * (of_reference if rest else 1.0)
         shares = {self.reference: own} if own else {}
         for one, share in (shares | dict.fromkeys(rest, (seconds - own) / max(len(rest), 1))).items():
-            self.told(0.0, f"piloting {one}")
+            self.told(self.known, f"piloting {one}")
             pilot = self.pilots[one]
             before = pilot.busy
-            pilot.run(share)
+            pilot.run(share, self.stopped)
             self.spent += (pilot.busy - before) / self.threads
+
+    def building(self, share: float, word: str) -> None:
+        """Say what is being built."""
+        self.told(self.known, word)
+
+    def stopped(self) -> bool:
+        """Return whether somebody wants the plan as it is, and there is one."""
+        return self.known > 0.0 and self.stop.is_set()
 
     def weigh(self) -> None:
         """See how much longer things take than they would if processors had nothing else to do."""
@@ -375,6 +450,8 @@ class _Planning(Evidence):
             self.notes.append(
                 f"processors are busy with other things: now everything takes {self.load:.1f} times as long"
             )
+        if self.stopped():
+            self.notes.append("planning was interrupted: this is what pilots had seen by then")
         assert self.reference is not None
         if not any(pilot.seen.mean > 0.0 for pilot in self.pilots.values()):
             self.notes.append("no pilot has seen any light: nothing is known of noise, and errors are expected ones")
@@ -399,7 +476,7 @@ class _Planning(Evidence):
         best = min(p.safe_seconds(self.target) for p in found)
         may = sorted((p for p in found if self.hopeful(p) <= NEAR * best), key=self.hopeful)
         first = []
-        for p in may[:MOST_FINALISTS]:
+        for p in may[: 0 if self.stopped() else MOST_FINALISTS]:
             if p.candidate in self.pilots or (self.spent < LATEST * self.budget and self.add(p.candidate)):
                 first.append(p.candidate)
         return first

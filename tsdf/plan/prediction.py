@@ -1,13 +1,18 @@
 """Predictions of candidates, and the plan that takes one of them."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from tsdf.plan.beliefs import Belief
 from tsdf.scene.scene import Scene
 from tsdf.study.candidates import Candidate, taken
+from tsdf.walk.explicit import Packed
+from tsdf.walk.geometry import Place
 
 TIE = 1.1  # times as long as the cheapest as it may take, of those the one with the least error is taken
+
+
+BLOCK = 16  # pixels across, of whose means the error is said where that of a pixel says little
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,12 @@ class Prediction:
     def error(self, seconds: float) -> float:
         """Return the whole error after so long [s]."""
         return math.hypot(self.floor.value, self.noise(seconds))
+
+    def error_of_blocks(self, seconds: float, across: float) -> float:
+        """Return the whole error of the means of `BLOCK` by `BLOCK` pixels after so long [s], if what it misses is
+        alike in so many of them across."""
+        patches = min(max(across, 1.0) / BLOCK, 1.0)
+        return math.hypot(self.bias, self.texture * patches, self.noise(seconds) / BLOCK)
 
     def likely_error(self, seconds: float) -> float:
         """Return the root mean square of the whole error after so long [s], over what the floor may be."""
@@ -96,8 +107,13 @@ class Plan:
         How many times as long things take now as they would if processors had nothing else to do.
     spp : int or None
         Samples per pixel that the picture has, where it is done then.
-    glints : bool
-        Whether single grains would have less error but are left out, for most of it would be the noise of their glints.
+    glints : float
+        Time from which on single grains are taken that are left out, for most of their error would be the noise of
+        their glints [s]; 0 where none are.
+    grain : float
+        How many pixels a grain looks across, about.
+    places, packings : dict
+        Geometry and packed grains of the scene as far as they were made, for `tsdf.picture.world.build`.
     """
 
     scene: Scene
@@ -113,7 +129,10 @@ class Plan:
     threads: int
     load: float = 1.0
     spp: int | None = None
-    glints: bool = False
+    glints: float = 0.0
+    grain: float = 1.0
+    places: dict[bool, Place] = field(default_factory=dict)
+    packings: dict[bool, Packed] = field(default_factory=dict)
 
     @property
     def chosen(self) -> Prediction:

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from tsdf.plan.prediction import TIE, Plan, Prediction
+from tsdf.plan.prediction import BLOCK, TIE, Plan, Prediction
 from tsdf.plan.prior import Body
 
 TARGETS = np.geomspace(0.002, 0.5, 120)  # [1] that are tried for what would change a plan's mind
 BUSY = 1.5  # times as long as on processors that have nothing else to do, from which on it is said
+MEANINGFUL = 0.5  # [1] above which the error of a pixel says little: a few glints make it
 OTHER = 1.2  # times as high or low as its target, from which on another target is another wish
 
 
@@ -74,7 +75,8 @@ def _first(plan: Plan) -> str:
         after = f"an error of {percent(p.error(plan.able))} after {span(plan.seconds)}"
         met = f"none is sure to meet {percent(plan.target)} in that time, and "
         if plan.glints:
-            met += "single grains, which meet suns by chance, would be mostly noise, so their glints are left out"
+            met += "single grains, which meet suns by chance, would be mostly noise until "
+            met += f"{span(plan.glints)}, so their glints are left out"
         else:
             met += "none that was looked at is likely to have a tenth less"
         if takes <= plan.able:
@@ -84,9 +86,24 @@ def _first(plan: Plan) -> str:
     else:
         after = f"an error of {percent(plan.target)} after {_about(takes)}"
         met = f"noise {percent(math.sqrt(max(plan.target**2 - p.floor.value**2, 0.0)))}"
+    if (blocks := _of_blocks(plan)) is not None:
+        met += (
+            f"; that is of a pixel over the mean of the picture, means of {BLOCK} by {BLOCK} pixels are off by {blocks}"
+        )
     if p.floor.error > p.floor.value > plan.target:
         met += f"; {percent(p.floor.value)} ± {percent(p.floor.error)} of it is expected, not measured"
     return f"take {p.candidate}{far}: {after} ({met})"
+
+
+def _of_blocks(plan: Plan) -> str | None:
+    """Return the error of means of many pixels, where that of one is so large that it says little."""
+    p = plan.chosen
+    seconds = p.turn * plan.spp if plan.spp is not None else plan.able
+    if seconds is None:
+        seconds = p.seconds(plan.target)
+    if not (seconds > 0.0 and p.error(seconds) > MEANINGFUL):
+        return None
+    return percent(p.error_of_blocks(seconds, plan.grain))
 
 
 def to_noise(plan: Plan, noise: float) -> str:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from tsdf.picture import render as pictures
 from tsdf.picture.render import Picture
-from tsdf.picture.world import build
+from tsdf.picture.world import World, build
 from tsdf.plan import report
 from tsdf.plan.planner import TARGET, plan
 from tsdf.plan.prediction import Plan
@@ -31,6 +31,13 @@ class Choice(NamedTuple):
     seconds: float | None
     target_error: float | None
     plan: Plan | None  # where the level was to be chosen
+
+    def world(self, leap: float | None = None, progress: Callable[[float, str], None] | None = None) -> World:
+        """Return its scene ready to be rendered, of what the plan has made of it as far as that goes."""
+        places, packings = (self.plan.places, self.plan.packings) if self.plan else ({}, {})
+        return build(
+            self.scene, self.scene.render.level, leap=leap, progress=progress, places=places, packings=packings
+        )
 
 
 def chosen(
@@ -127,7 +134,7 @@ def render(
     scene = resized(scene, width)
     seed = scene.render.seed if seed is None else seed
     choice = chosen(scene, level, spp, seconds, target_error, seed, threads)
-    world = build(choice.scene, choice.scene.render.level)
+    world = choice.world()
     for note in (*(choice.plan.notes if choice.plan else ()), *world.notes):
         warnings.warn(note, stacklevel=2)
     return pictures.render(world, choice.spp, choice.seconds, choice.target_error, seed, threads)
