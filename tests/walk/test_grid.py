@@ -8,7 +8,7 @@ from numba import njit
 
 from tsdf.grain.grains import first_hit, load_grain, triangle_scene
 from tsdf.walk.geometry import box_mesh, planes_of, within
-from tsdf.walk.grid import OUTSIDE, UNKNOWN, Grid, compared, grid_of, home_of, line_of, march, plane_hit
+from tsdf.walk.grid import OUTSIDE, UNKNOWN, Grid, compared, grid_of, home_of, march, plane_hit
 
 RAYS = 4000
 THICK = 1e-6
@@ -25,7 +25,7 @@ def looked_at(grid, p, d, end, met):
     for i in range(p.shape[0]):
         a, b = (p[i, 0], p[i, 1], p[i, 2]), (d[i, 0], d[i, 1], d[i, 2])
         for facet in range(grid.corners.shape[0]):
-            compared(grid, met[i], facet, a, b, line_of(a, b), end[i])
+            compared(grid, met[i], facet, a, b, end[i])
 
 
 def rays(grid: Grid, p: np.ndarray, d: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
