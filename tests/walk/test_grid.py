@@ -17,7 +17,7 @@ THICK = 1e-6
 @njit
 def marched(grid, p, d, end, met, known):
     for i in range(p.shape[0]):
-        known[i] = march(grid, met[i], (p[i, 0], p[i, 1], p[i, 2]), (d[i, 0], d[i, 1], d[i, 2]), end[i])
+        known[i] = march(grid, met[i], -1, (p[i, 0], p[i, 1], p[i, 2]), (d[i, 0], d[i, 1], d[i, 2]), end[i])
 
 
 @njit
@@ -25,7 +25,7 @@ def looked_at(grid, p, d, end, met):
     for i in range(p.shape[0]):
         a, b = (p[i, 0], p[i, 1], p[i, 2]), (d[i, 0], d[i, 1], d[i, 2])
         for facet in range(grid.corners.shape[0]):
-            compared(grid, met[i], facet, a, b, end[i])
+            compared(grid, met[i], -1, facet, a, b, end[i])
 
 
 def rays(grid: Grid, p: np.ndarray, d: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

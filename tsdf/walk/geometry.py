@@ -23,7 +23,7 @@ from tsdf.grain.meshes import read_mesh
 from tsdf.scene.keys import FARTHEST
 from tsdf.scene.scene import SMALLEST, Box, MediumSpec, Mesh, Rectangle, Scene, Slab, Sphere, SurfaceSpec, called
 from tsdf.vectors import KERNEL, dot, step
-from tsdf.walk.grid import GRAZING, NONE, ROUNDING, Grid, free_around, grid_of, held, march
+from tsdf.walk.grid import GRAZING, MOST_MEDIA, NONE, ROUNDING, Grid, free_around, grid_of, held, march
 from tsdf.walk.room import BALL, BOX, CLOSED, MESH, OPEN, SLAB, Room, exact_depth, room_of
 
 SLACK = 2e-6  # [of a facet's largest coordinate] a point this near to a facet is on it: 30 float32 ulps
@@ -149,7 +149,7 @@ def unmet(g, met, m, p, d, end):
             return False, False
     if g.engines == 0 or (g.convex and held(g.grid, m, step(p, end, d))):
         return True, False
-    if not march(g.grid, met, p, d, end):
+    if not march(g.grid, met, m, p, d, end):
         return False, False
     for e in range(met.shape[0]):
         if met[e] != NONE:
@@ -304,8 +304,10 @@ def place(scene: Scene, grains: bool = False) -> Place:
     Raises
     ------
     SceneError
-        A boundary that is not a closed, simple surface, media that overlap, a mesh that cannot be read.
+        A boundary that is not a closed, simple surface, media that overlap, a mesh that cannot be read, too many media.
     """
+    if len(scene.media) > MOST_MEDIA:
+        raise SceneError(f"{scene.name}: has {len(scene.media)} media, of at most {MOST_MEDIA}; leave some out")
     boundaries, notes = _boundaries(scene)
     surfaces = [
         None if isinstance(s.shape, Sphere) else _surface_mesh(s, f"{scene.name}: {called('surface', i, s.name)}")

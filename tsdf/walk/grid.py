@@ -20,6 +20,7 @@ from tsdf.vectors import KERNEL, dot
 STEPS = 64  # of a ray through the grid; the ray engine is faster with those that need more
 OUTSIDE = 16  # facets that reach out of the grid, with more of which rays that leave it are left to the ray engine
 MOST_LISTED = 2e7  # facets in all cells, about: cells of very many large facets are larger
+FEW_LISTED, EACH_LISTED = 4e5, 30  # the most there, and for each facet more: a wide floor needs no fine cells
 BATCH = 1 << 17  # triangles and boxes that are looked at together
 PAD = 0.004  # [cells] facets count as in a cell when this near to it, far more than the rounding of the way through
 GRAZING = 100.0  # times its thickness is the most that a point is moved off a facet along a ray
@@ -27,6 +28,7 @@ FEW = 3  # facets in a cell, below which nothing is gained by looking whether th
 ROUNDING = 1e-13  # of coordinates: some hundreds of the last bits of heights; what leans outward by less is flat
 BEYOND = 1.0 + 1e-9  # walls of cells that a ray has passed, or nearly so, count
 NEAR = 1e-7  # [cells] that near to a facet, on which side of it a place is is not asked
+MOST_MEDIA = 2**15 - 1  # whose numbers a grid has room for
 NONE, UNKNOWN = -1, -2
 
 
@@ -151,9 +153,9 @@ def free_around(grid, p, least):
 
 
 @njit(forceinline=True, **KERNEL)
-def compared(grid, met, facet, p, d, end):
+def compared(grid, met, m, facet, p, d, end):
     """Note a facet that a ray meets before `end` in `met` (meshes,), if it is the first of its mesh so far; return the
-    distance, or infinity."""
+    distance, or infinity where another medium's boundary does not end a way in medium m."""
     n = (grid.planes[facet, 0], grid.planes[facet, 1], grid.planes[facet, 2])
     cosine, height = dot(n, d), grid.planes[facet, 3] - dot(n, p)
     if not (height * cosine >= 0.0 and abs(height) <= end * abs(cosine)):
@@ -165,13 +167,13 @@ def compared(grid, met, facet, p, d, end):
     before = met[mesh]
     if before == NONE or t < plane_hit(grid.planes, before, p, d)[0]:
         met[mesh] = facet
-    return t
+    return t if met.shape[0] == 1 or m < 0 or grid.owner[mesh] == m or grid.owner[mesh] == NONE else math.inf
 
 
 @njit(forceinline=True, **KERNEL)
-def searched(grid, met, what, p, d, inside, end):
-    """Note in `met` which facets of an occupied cell a ray meets, that is in it between two distances; return how far
-    it is still of interest."""
+def searched(grid, met, m, what, p, d, inside, end):
+    """Note in `met` which facets of an occupied cell a ray in medium m meets, that is in it between two distances;
+    return how far it is still of interest."""
     here, there = grid.first[what], grid.first[what + 1]
     if there - here >= FEW:  # it may be on one side of all of them
         n = (grid.slabs[what, 0], grid.slabs[what, 1], grid.slabs[what, 2])
@@ -180,21 +182,22 @@ def searched(grid, met, what, p, d, inside, end):
         if min(a, b) > grid.slabs[what, 4] or max(a, b) < grid.slabs[what, 3]:
             return end
     for at in range(here, there):
-        end = min(end, compared(grid, met, grid.listed[at], p, d, end) + grid.margin)
+        end = min(end, compared(grid, met, m, grid.listed[at], p, d, end) + grid.margin)
     return end
 
 
 @njit(**KERNEL)
-def march(grid, met, p, d, end):
+def march(grid, met, m, p, d, end):
     """Note in `met` (meshes,) the first facets that a ray meets, NONE where there is none; return whether it is known.
 
-    What is met farther than `end`, or behind what is at the place of the first facet, may be missing.
+    What is met farther than `end`, or behind what is at the place of the first facet of medium m or of a surface, may
+    be missing; of any mesh where m is none.
     """
     for e in range(met.shape[0]):
         met[e] = NONE
     for at in range(grid.outer.shape[0]):
         facet = grid.outer[at]
-        end = min(end, compared(grid, met, facet, p, d, end + GRAZING * grid.thickness[facet]))
+        end = min(end, compared(grid, met, m, facet, p, d, end + GRAZING * grid.thickness[facet]))
     end += grid.margin
     nx, ny, nz = grid.free.shape
     size = 1.0 / grid.edge
@@ -226,7 +229,7 @@ def march(grid, met, p, d, end):
             return False
         what = int(grid.cells[cell])
         if what >= 0:
-            end = searched(grid, met, what, p, d, (t, min(end, min(tx, min(ty, tz)))), end)
+            end = searched(grid, met, m, what, p, d, (t, min(end, min(tx, min(ty, tz)))), end)
         if what >= -1:
             t = min(tx, min(ty, tz))
             cell += (nextx if tx <= t else 0) + (nexty if ty <= t else 0) + (nextz if tz <= t else 0)
@@ -402,7 +405,8 @@ def grid_of(meshes: Sequence[np.ndarray], owner: np.ndarray, planes: np.ndarray,
     size = np.maximum(high - low, 1e-3 * (high - low).max())
     sides = np.sort(np.clip(corners.max(axis=1), low, high) - np.clip(corners.min(axis=1), low, high), axis=1)
     area = float((sides[:, 1] * sides[:, 2]).sum())  # of the facets in the box, at most twice as much
-    edge = max(float((size.prod() / cells) ** (1 / 3)), math.sqrt(area / MOST_LISTED), least)
+    most = min(FEW_LISTED + EACH_LISTED * len(corners), MOST_LISTED)
+    edge = max(float((size.prod() / cells) ** (1 / 3)), math.sqrt(area / most), least)
     counts = np.ceil(size / edge).astype(int) + 2
     low = 0.5 * (low + high) - 0.5 * counts * edge
     free, first, listed = cells_of(corners, planes, low, edge, counts)

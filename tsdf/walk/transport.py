@@ -464,7 +464,7 @@ def look(world, batch, w):
     elif w.free >= 0.0:
         end = w.free
     spot = batch.hits.shape[0] - 1
-    if not march(g.grid, batch.hits[spot], triple(w.p), way, max(end, 0.0)):
+    if not march(g.grid, batch.hits[spot], w.medium, triple(w.p), way, max(end, 0.0)):
         return False
     w.ray = spot
     return True
