@@ -32,7 +32,8 @@ SLOTS = 2048  # walkers under way at once, per thread, but for shadows: their st
 ROOM = 4 * SLOTS
 BLOCK = 65536  # samples of a block, about: the last few walkers of each wait for the ray engine alone
 LEAST = 4096  # samples of a block, however few are asked for
-PARTS = 16  # of a pass, so that threads have something to share; and of the time, so that it is kept
+PIECES = 128  # of a pass: with few, threads wait for the one whose part of the picture is slowest
+PARTS = 16  # of the time, so that it is kept; and blocks of the largest pass
 FEW = 16  # samples per pixel of a pass of a large picture; the first has one, so that soon no pixel is black
 BLACK = 256  # samples per pixel after which a black picture needs no smaller error
 GROWTH = 8  # of a pass over the one before it, at most, while it is not known how long they take
@@ -316,7 +317,7 @@ class Portion(NamedTuple):
 
 def _blocks(count: int, done: int, share: int) -> Iterator[Portion]:
     """Yield the blocks of a pass of `share` samples over `count` pixels, each of which has `done` of them already."""
-    size = min(max(share * count // PARTS, LEAST), BLOCK)
+    size = min(max(share * count // PIECES, LEAST), BLOCK)
     number = min(share, size)
     step = max(1, size // number)
     for sample in range(done, done + share, number):

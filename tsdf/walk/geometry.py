@@ -61,6 +61,21 @@ class Geometry(NamedTuple):
 
 
 @njit(forceinline=True, **KERNEL)
+def _between(low, high, at, d):
+    """Return where a ray comes between two parallel planes, where it goes, and whether it begins there.
+
+    It begins at height `at` and gains d per length. Where it is never between them, it comes after it has gone.
+    """
+    low, high = low - at, high - at
+    begins = low < 0.0 < high
+    if d == 0.0:
+        return (-math.inf, math.inf, True) if begins else (math.inf, -math.inf, False)
+    each = 1.0 / d
+    low, high = low * each, high * each
+    return min(low, high), max(low, high), begins
+
+
+@njit(forceinline=True, **KERNEL)
 def exact_hit(kind, shape, p, d):
     """Return distance to a slab, box or ball, whether p is inside, and the outward normal there."""
     if kind == BALL:
@@ -75,32 +90,23 @@ def exact_hit(kind, shape, p, d):
             t = -along - math.sqrt(root)
         m = step(q, t, d)
         return t, rest < 0.0, (m[0] / shape[3], m[1] / shape[3], m[2] / shape[3])
-    first = 2 if kind == SLAB else 0
-    near, far, near_axis, far_axis, inside = -math.inf, math.inf, -1, -1, True
-    for k in range(first, 3):
-        low, high = shape[k] - p[k], shape[3 + k] - p[k]
-        if not low < 0.0 < high:
-            inside = False
-        if d[k] == 0.0:
-            if not low < 0.0 < high:
-                return math.inf, False, (0.0, 0.0, 0.0)
-            continue
-        each = 1.0 / d[k]
-        a, b = low * each, high * each
-        if d[k] < 0.0:
-            a, b = b, a
-        if a > near:
-            near, near_axis = a, k
-        if b < far:
-            far, far_axis = b, k
-    if not inside and (near > far or near < 0.0 or near_axis < 0):
-        return math.inf, False, (0.0, 0.0, 0.0)
-    axis = far_axis if inside else near_axis
-    if axis < 0:
+    near, far, inside = _between(shape[2], shape[5], p[2], d[2])
+    near_axis = far_axis = 2
+    if kind != SLAB:
+        a, b, between = _between(shape[1], shape[4], p[1], d[1])
+        inside &= between
+        near, near_axis = (a, 1) if a >= near else (near, near_axis)
+        far, far_axis = (b, 1) if b <= far else (far, far_axis)
+        a, b, between = _between(shape[0], shape[3], p[0], d[0])
+        inside &= between
+        near, near_axis = (a, 0) if a >= near else (near, near_axis)
+        far, far_axis = (b, 0) if b <= far else (far, far_axis)
+    t, axis = (far, far_axis) if inside else (near, near_axis)
+    if (not inside and (near > far or near < 0.0)) or abs(t) == math.inf:
         return math.inf, inside, (0.0, 0.0, 0.0)
-    side = 1.0 if (d[axis] > 0.0) == inside else -1.0
-    n = (side if axis == 0 else 0.0, side if axis == 1 else 0.0, side if axis == 2 else 0.0)
-    return (far if inside else near), inside, n
+    along = d[0] if axis == 0 else (d[1] if axis == 1 else d[2])
+    side = 1.0 if (along > 0.0) == inside else -1.0
+    return t, inside, (side if axis == 0 else 0.0, side if axis == 1 else 0.0, side if axis == 2 else 0.0)
 
 
 @njit(**KERNEL)

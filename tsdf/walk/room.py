@@ -55,10 +55,10 @@ def exact_depth(kind, shape, p):
     if kind == BALL:
         q = (p[0] - shape[0], p[1] - shape[1], p[2] - shape[2])
         return shape[3] - math.sqrt(dot(q, q))
-    depth = math.inf
-    for k in range(2 if kind == SLAB else 0, 3):
-        depth = min(depth, min(p[k] - shape[k], shape[3 + k] - p[k]))
-    return depth
+    depth = min(p[2] - shape[2], shape[5] - p[2])
+    if kind == SLAB:
+        return depth
+    return min(depth, min(min(p[0] - shape[0], shape[3] - p[0]), min(p[1] - shape[1], shape[4] - p[1])))
 
 
 @njit(**KERNEL)

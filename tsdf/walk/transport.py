@@ -226,12 +226,18 @@ def connect(world, batch, w, amounts, p, c, share, bound):
                 write(shadow.p, end)
 
 
+@njit(forceinline=True, **KERNEL)
+def unit_of(v):
+    """Return the unit vector along v."""
+    norm = 1.0 / math.sqrt(dot(v, v))
+    return v[0] * norm, v[1] * norm, v[2] * norm
+
+
 @njit(**KERNEL)
 def aim(w, offset, size, d_out, amount, c):
     """Begin a jump of given size along an offset of any length."""
     w.mode, w.length, w.gained, w.component = JUMP, size, amount, c
-    norm = 1.0 / math.sqrt(dot(offset, offset))
-    write(w.e, (offset[0] * norm, offset[1] * norm, offset[2] * norm))
+    write(w.e, unit_of(offset))
     write(w.q, d_out)
 
 
@@ -300,16 +306,19 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
             key += GOLDEN
             free = -mean * math.log(1.0 - unit(mix(key)))
         if not once and bound <= free:
-            if not fresh:
+            if not fresh and (bound <= 0.0 or not convex):
                 bound = clearance(g, m, p, free)
             if bound <= free:
                 if convex:
-                    sure, known = bound > 0.0 and clearance(g, m, step(p, free, d)) > hair, False
+                    there = clearance(g, m, step(p, free, d)) - hair
+                    if bound <= 0.0 or there <= 0.0:
+                        break
+                    bound = there + free
                 else:
                     sure, known = unmet(g, batch.hits[spot], m, p, d, free)
-                if not sure:
-                    w.ray = spot if known else NONE
-                    break
+                    if not sure:
+                        w.ray = spot if known else NONE
+                        break
         if steps >= most or (not once and full(batch)):
             state = WAIT
             break
@@ -364,23 +373,26 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
             luck += absorption.least[media.slot[c]] * length
         if reach > 0.0:
             size = scale * math.sqrt(dot(offset, offset))
-            if bound <= size:
+            if bound <= size and (bound <= 0.0 or not convex):
                 bound = clearance(g, m, p, size)
-            if bound <= size and size > 0.0:
-                aim(w, offset, size, d, length, c)
-                end = step(p, size, triple(w.e))
+            there = bound - size
+            if there > 0.0 or size == 0.0:
+                p, bound = step(p, scale, offset), there
+            else:
+                e = unit_of(offset)
+                end, sure, known = step(p, size, e), False, False
                 if convex:
-                    sure, known = bound > 0.0 and clearance(g, m, end) > hair, False
+                    there = clearance(g, m, end) - hair
+                    sure = bound > 0.0 and there > 0.0
                 else:
-                    sure, known = unmet(g, batch.hits[spot], m, p, triple(w.e), size)
+                    sure, known = unmet(g, batch.hits[spot], m, p, e, size)
+                    there = 0.0
                 if sure:
-                    w.mode, p, bound = FLY, end, 0.0
+                    p, bound = end, there
                 else:
+                    aim(w, offset, size, d, length, c)
                     w.ray = spot if known else NONE
                     once = True
-            else:
-                p = step(p, scale, offset)
-                bound -= size
         if luck < DIM and w.mode != JUMP:  # a jump that ends on a boundary gives some of its length back
             w.luck = luck
             key += GOLDEN
