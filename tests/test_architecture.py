@@ -17,7 +17,7 @@ ROOT = PACKAGE.parent
 
 # Rooms in order: a module imports those of its own room and of the rooms before it. "" is the root.
 ROOMS = ["", "grain", "data", "judge", "make", "spheres", "scene", "walk", "picture", "study", "plan", "stress"]
-ROOT_MODULES = {"archive", "compiled", "errors", "files", "handle", "sampling", "vectors"}
+ROOT_MODULES = {"archive", "compiled", "errors", "files", "handle", "sampling", "simplex", "vectors"}
 DOORS = {
     "numba": {"compiled", "handle"},
     "DracoPy": {"gltf"},

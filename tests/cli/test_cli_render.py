@@ -325,6 +325,7 @@ def test_level_auto(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "chosen" not in facts(folder / "b.exr")
 
 
+@pytest.mark.slow
 def test_fewer_far(folder: Path) -> None:
     """K-0 is what a scene says with fewer_far = true, and not what K is."""
     assert run(folder, "--explicit-grains", "3-0", out="f.exr").exit_code == 0

@@ -824,3 +824,21 @@ def test_shells_within_shells_are_bounded(limit, monkeypatch):
     assert grain.bodies == 20 and "20 cavities" in grain.notes
     monkeypatch.setattr(surface, limit, 700)
     refused("40 shells inside the bounding boxes of others", *nested)
+
+
+# ------------------------------------------------------------------------------------- what is linked
+
+
+@pytest.mark.parametrize(("count", "links"), [(1, 0), (5, 3), (1000, 400), (1000, 900), (20_000, 15_000)])
+def test_connected(count, links):
+    """Random links, and those of a path whose numbers are shuffled: each thing knows the first that it hangs on."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    rng = np.random.default_rng(count)
+    path = rng.permutation(count)
+    for one, other in (rng.integers(0, count, (2, links)), (path[:-1], path[1:])):
+        graph = coo_array((np.ones(len(one)), (one, other)), (count, count))
+        _, label = connected_components(graph, directed=False)
+        expected = np.unique(label, return_index=True)[1][label]
+        assert (surface.connected(count, one, other) == expected).all()

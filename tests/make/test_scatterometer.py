@@ -137,6 +137,27 @@ def test_part_of_another_build_is_refused(octahedron: Grain, tmp_path: Path) -> 
         merge([tmp_path / "a", tmp_path / "b"])
 
 
+def test_no_save_waits_for_what_is_sought(octahedron: Grain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The extent of a huge mesh takes seconds: paths are safe before it is found, and the table has it all the same."""
+    part, there = tmp_path / "x.part", []
+    sought = scatterometer.extent_header
+
+    def late(grain: Grain) -> dict[str, float]:
+        end = time.monotonic() + 20.0
+        while not part.exists() and time.monotonic() < end:
+            time.sleep(0.01)
+        there.append(part.exists())
+        return sought(grain)
+
+    monkeypatch.setattr(scatterometer, "extent_header", late)
+    monkeypatch.setattr(scatterometer, "SAVE_S", 0.0)
+    build = Build.start(octahedron, Optics(1.31), Effort(paths=40_000))
+    build.run(octahedron, 1, part_file=part)
+    assert there == [True]
+    whole = Build.load(part).table()
+    assert whole.header["grain"]["x_sieve"] == build.table().header["grain"]["x_sieve"] > 0.0
+
+
 def test_resuming_gives_the_same_bytes(octahedron: Grain, reference: bytes, tmp_path: Path) -> None:
     """Stop when the first paths are done, as Ctrl-C would, and go on from the part file."""
     part = tmp_path / "x.part"
@@ -566,6 +587,31 @@ def test_merging_cells_keeps_the_sums() -> None:
         assert np.array_equal(columns[:, -1], tally.theta[:, T.FINE])
         edges = statistics.cos_theta_edges(cells)
         assert np.all(np.diff(edges[1:-1]) > 0)
+
+
+@pytest.mark.parametrize("cells", [8, 16, 100, 333, 512, 1024])
+def test_parts_of_columns(cells: int) -> None:
+    """Sums over parts, what they have beside their share of the column, and its variance, as numpy finds them."""
+    tally = Tally()
+    rng = np.random.default_rng(cells)
+    tally.theta[:] = rng.integers(0, 1 << 30, tally.theta.shape)
+    tally.scalars[:, T.SCATTERED] = tally.theta.sum(axis=1)
+    errors = statistics.TableErrors(tally)
+    columns = statistics.columns_of(errors._theta, cells)[:, -2:0:-1]
+    for parts in (1, 2, 4):
+        cuts, finer = errors._parts(cells, parts)
+        assert (finer == np.add.reduceat(errors._theta[:, : T.FINE], cuts[:-1], axis=1)).all()
+        assert parts > 1 or (finer == columns).all()
+        share = rng.random((cells, parts))
+        found = np.zeros((2, cells, parts))
+        statistics._deviations(finer.reshape(-1, cells, parts), np.ascontiguousarray(columns), share, found)
+        deviations = finer.reshape(-1, cells, parts) - columns[:, :, None] * share
+        assert (found[0] == deviations.mean(axis=0)).all()
+        assert found[1] == pytest.approx(deviations.var(axis=0, ddof=1) / T.REPLICATES, rel=1e-9)
+    values = rng.normal(size=cells)
+    window = min(17, cells)
+    around = [values[max(0, i - window // 2) : i + (window + 1) // 2].mean() for i in range(cells)]
+    assert statistics._pooled(values, window) == pytest.approx(np.array(around), rel=1e-9, abs=1e-12)
 
 
 @pytest.mark.slow

@@ -427,3 +427,22 @@ def test_replicates_are_independent() -> None:
 def test_the_name_of_a_grain_does_not_matter() -> None:
     grain = load_grain("tetrahedron")
     assert_equal(traced(grain, 5_000), traced(replace(grain, name="other"), 5_000))
+
+
+@pytest.mark.parametrize("name", ["sphere", "cube"])
+def test_weak_reflections_are_not_rounded_away(name: str) -> None:
+    """What a surface of eta 1.0005 sends steeply back is less than a unit of energy of each path: in the mean it is
+    Fresnel's all the same, under light from all sides, deflected by more than 3/4 pi. Light turned back inside is as
+    much again, but met by one path in 10 million, whole."""
+    eta, tally = 1.0005, Tally()
+    Tracer(load_grain(name), eta).trace(in_order(0, 64_000), tally)
+    cosines = (np.arange(200_000) + 0.5) / 200_000
+    inside = np.sqrt(eta**2 - 1.0 + cosines**2)
+    s, p = (cosines - inside) / (cosines + inside), (eta**2 * cosines - inside) / (eta**2 * cosines + inside)
+    steep = cosines >= math.cos(math.pi / 8.0)  # light that is mirrored is deflected by pi - 2 theta_i
+    expected = float((cosines * (s**2 + p**2))[steep].sum() / 200_000)
+    back = tally.theta[:, 3 * T.FINE // 4 : T.FINE].sum(axis=1) + tally.theta[:, T.FINE + 1]
+    share = back / tally.scalars[:, T.SCATTERED]
+    error = share.std(ddof=1) / math.sqrt(T.REPLICATES)
+    assert error < 0.05 * expected
+    assert abs(share.mean() - expected) < 5.0 * error, (share.mean(), expected, error)

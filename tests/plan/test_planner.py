@@ -390,6 +390,7 @@ def test_bias_falls_with_the_grains_that_are_left_to_a_level(ball: tsdf.Table, m
     assert abs(run.predicted(Candidate("teleport", 16)).bias) < 0.0031
 
 
+@pytest.mark.slow
 def test_bolder_leaps_are_looked_at_where_they_may_win(far: Plan, ball: tsdf.Table) -> None:
     """At the level whose events are dear, where there are leaps, nobody has named any, and the error would still do;
     what is taken is rendered so, and the options that fix it say so."""

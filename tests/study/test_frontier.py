@@ -46,7 +46,7 @@ from tsdf.study.ranking import mean_of
 from tsdf.walk.explicit import built_in
 
 SIGMAS = 4.5
-RUNS = 8
+RUNS, FEW = 8, 3
 ALL = candidates(("explicit", "teleport-memory", "teleport-joint", "teleport", "volume", "isotropic"), (0, 2))
 
 
@@ -64,14 +64,25 @@ def ball(table: Table) -> Scene:
     return Scene(camera, (ConstantLight((1.0, 1.0, 1.0)),), (medium,), (plate,), name="ball")
 
 
-@pytest.fixture(scope="module")
-def found(ball: Scene) -> Frontier:
-    """All levels, with and without explicit grains first, in eight runs of 192 samples, whatever time they take."""
+def measured(ball: Scene, samples: int, runs: int) -> Frontier:
+    """All levels, with and without explicit grains first, in runs of so many samples, whatever time they take."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(frontier, "_affordable", lambda *_: 192)
-        made = frontier.measure(ball, ALL, runs=RUNS, seed=4, threads=1)
+        patched.setattr(frontier, "_affordable", lambda *_: samples)
+        made = frontier.measure(ball, ALL, runs=runs, seed=4, threads=1)
     assert made is not None
     return made
+
+
+@pytest.fixture(scope="module")
+def found(ball: Scene) -> Frontier:
+    """A short one, to be written and drawn."""
+    return measured(ball, 32, FEW)
+
+
+@pytest.fixture(scope="module")
+def known(ball: Scene) -> Frontier:
+    """One from which to judge."""
+    return measured(ball, 192, RUNS)
 
 
 def chance(values: Any) -> float:
@@ -105,42 +116,43 @@ def test_squares_have_no_bias(ball: Scene) -> None:
 
 
 @pytest.mark.slow
-def test_all_candidates_are_measured(found: Frontier) -> None:
+def test_all_candidates_are_measured(known: Frontier) -> None:
     """Each has its row, best level first, eight runs, and the times at which its samples double."""
-    assert [row.candidate for row in found.rows] == list(ALL)
-    assert found.truth == "explicit" and found.runs == found.asked == RUNS
-    for row in found.rows:
+    assert [row.candidate for row in known.rows] == list(ALL)
+    assert known.truth == "explicit" and known.runs == known.asked == RUNS
+    for row in known.rows:
         assert len(row.seconds) == len(row.noise) == len(row.squares) == len(row.flip) == RUNS
-        assert set(row.bias) == set(found.regions)
+        assert set(row.bias) == set(known.regions)
         times = [spent for spent, _ in row.curve]
         assert len(times) == 5 and times == sorted(times) and times[-1] == pytest.approx(np.mean(row.seconds))
         assert row.seconds_per_sample * row.samples * row.pixels == pytest.approx(np.mean(row.seconds))
-        if not found.exact(row):
+        if not known.exact(row):
             assert mean_of(row.curve[0][1]).value > mean_of(row.curve[-1][1]).value
 
 
 @pytest.mark.slow
-def test_what_is_known_of_levels_is_found(found: Frontier) -> None:
+def test_what_is_known_of_levels_is_found(known: Frontier) -> None:
     """The truth's own level, measured as all others, differs by nothing: the control. Every chain without explicit
     grains has the texture of single grains missing; the chain that forgets where light left the last grain, and fills
     the ball to its brim, is too bright or too dark by far; two explicit grains leave less to miss."""
-    control = of(found, "explicit")
+    control = of(known, "explicit")
     assert chance(control.squares) > 1e-4 and chance(control.bias["whole"]) > 1e-4
-    assert not control.floor.seen or control.floor.value < 0.3 * of(found, "volume").floor.value
-    assert found.floor(control).value == 0.0
+    assert not control.floor.seen or control.floor.value < 0.3 * of(known, "volume").floor.value
+    assert known.floor(control).value == 0.0
     for name in ("teleport-memory", "teleport-joint", "teleport", "volume"):
-        assert of(found, name).floor.seen
-        assert of(found, name).texture_square.value > 4.0 * of(found, name).texture_square.error
-    assert chance(of(found, "teleport-joint").bias["whole"]) < 1e-3
-    fewer = np.array(of(found, "teleport-memory").squares) - of(found, "teleport-memory k=2").squares
+        assert of(known, name).floor.seen
+        assert of(known, name).texture_square.value > 4.0 * of(known, name).texture_square.error
+    assert chance(of(known, "teleport-joint").bias["whole"]) < 1e-3
+    fewer = np.array(of(known, "teleport-memory").squares) - of(known, "teleport-memory k=2").squares
     assert fewer.mean() > 0.0 and chance(fewer) < 1e-2
 
 
-def test_floor_and_noise_make_the_curve(found: Frontier) -> None:
+@pytest.mark.slow
+def test_floor_and_noise_make_the_curve(known: Frontier) -> None:
     """The error of the runs at each number of samples is floor squared and noise squared, as far as the spread of their
     difference can tell: noise is what the samples of all of a run say, over their number. Control: without the noise it
     is not, at the fewest samples."""
-    for row in found.rows:
+    for row in known.rows:
         for step, (_, squares) in enumerate(row.curve):
             times = 2.0 ** (len(row.curve) - 1 - step)
             assert chance(np.array(squares) - row.squares - np.array(row.noise) * times) > 1e-4, (row.candidate, step)
@@ -210,6 +222,29 @@ def test_leaps_are_candidates_of_the_levels_that_leap(ball: Scene) -> None:
     assert len(widths) >= 2
 
 
+def test_of_many_candidates_few_are_named(found: Frontier) -> None:
+    """All of a few; of many the least error at any time, and of each level the least floor."""
+    assert frontier_plots.named(found, 0.1, 100.0) == list(found.rows)
+    row = found.rows[0]
+
+    def made(level: str, grains: int, floor: float, noise: float) -> Measured:
+        runs = (1.0,) * found.runs
+        squares = tuple(floor**2 * (1.0 + 0.01 * (-1) ** k) for k in range(found.runs))
+        return replace(row, candidate=Candidate(level, grains), seconds=runs, noise=(noise**2,) * found.runs,
+                       squares=squares)  # fmt: skip
+
+    rows = [made("teleport", k, 0.01 + 0.001 * k, 0.5) for k in range(9)]
+    rows += [made("teleport-joint", k, 0.02 - 0.001 * k, 0.5) for k in range(9)]
+    rows += [made("isotropic", 0, 0.3, 0.001), made("volume", 0, 0.005, 0.1), made("volume", 1, 0.006, 0.05)]
+    many = replace(found, rows=tuple(rows))
+    names = [str(one.candidate) for one in frontier_plots.named(many, 0.01, 1000.0)]
+    assert names == ["teleport", "teleport-joint k=8", "isotropic", "volume", "volume k=1"]
+    figure = frontier_plots.plot_frontier(many)
+    beside = [text.get_text().split("  ")[0] for text in figure.axes[0].texts if text.get_text()]
+    assert beside == names
+    assert f"{len(names)} of 21 named" in figure.get_suptitle()
+
+
 def test_bytes_are_of_what_a_level_draws_from(found: Frontier) -> None:
     """Cheaper levels hold less, explicit grains hold more, and points know no table."""
     held = {str(row.candidate): row.bytes for row in found.rows}
@@ -236,6 +271,7 @@ def test_impossible_candidates_are_said(ball: Scene) -> None:
         frontier.measure(loose, [Candidate("teleport-joint")], seconds=0.2, runs=2)
 
 
+@pytest.mark.slow
 def test_no_level_that_meets_a_small_sun_by_chance_is_believed(ball: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Under a small sun the truth is the best level that aims at it, and what has explicit grains is left out, once.
 
@@ -326,8 +362,8 @@ def test_results_are_read_again(found: Frontier, tmp_path: Path) -> None:
         lambda held: held["candidates"][0].update(samples=0),
         lambda held: held["candidates"][1]["runs"]["squares"].pop(),
         lambda held: held["candidates"][1]["runs"]["bias"].pop("whole"),
-        lambda held: held["candidates"][1]["runs"].update(noise=["a"] * RUNS),
-        lambda held: held["candidates"][1]["runs"].update(noise=[math.nan] * RUNS),
+        lambda held: held["candidates"][1]["runs"].update(noise=["a"] * FEW),
+        lambda held: held["candidates"][1]["runs"].update(noise=[math.nan] * FEW),
         lambda held: held.update(width=1e999),
         lambda held: held.update(width="12"),
         lambda held: held.update(scene=None),
@@ -365,7 +401,7 @@ def test_a_screen_shows_the_table_and_where_the_rest_is(found: Frontier) -> None
     for some in heads:
         assert [head for head in some if head in always] == always
     assert sum("region" in head for head in heads[1]) < 2
-    slim = tuple(replace(row, squares=(1e-4,) * RUNS) for row in few.rows)
+    slim = tuple(replace(row, squares=(1e-4,) * FEW) for row in few.rows)
     slimmer = frontier_files.terminal(replace(few, rows=slim), "a.md")
     assert "texture [%]" in slimmer and "kB" in slimmer
 
@@ -382,7 +418,7 @@ def test_numbers_with_their_error(value: float, error: float, text: str) -> None
 def test_charts_draw_no_limit_as_a_measurement(found: Frontier) -> None:
     """Floors that are not seen have no mark over bytes, and their lines end where the limit begins; ticks have room."""
     limit, seen = of(found, "teleport"), of(found, "volume")
-    unseen = replace(limit, squares=tuple(1e-3 * (-1.0) ** k for k in range(RUNS)))
+    unseen = replace(limit, squares=tuple(1e-3 * (-1.0) ** k for k in range(FEW)))
     drawn = replace(found, rows=(found.rows[0], unseen, seen))
     assert not unseen.floor.seen and seen.floor.seen
     left, right = frontier_plots.plot_frontier(drawn).axes

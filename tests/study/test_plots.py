@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 
+import tsdf
 from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table, thawed
 from tsdf.errors import TSDFError, UsageError
@@ -45,6 +46,17 @@ def test_columns_stand_at_their_edges_with_their_densities(tables):
     np.testing.assert_allclose(np.ma.filled(image.get_array(), 0.0), density, rtol=1e-6)
     steps = axes_of(plots.plot_table(table), "p_\\theta").patches[0].get_data()
     np.testing.assert_allclose(steps.values, table.p_theta[1:-1] / np.diff(table.cos_theta_edges)[1:-1])
+
+
+def test_few_long_paths_do_not_set_the_axis():
+    """One light path in ten thousand of the quartz grain is hundreds of R long; what the picture leaves out it says."""
+    table = tsdf.library("quartz")
+    axes = axes_of(plots.plot_table(table), r"p(l\,")
+    low, high = axes.get_ylim()
+    share = table.p_l @ table.p_theta
+    longer = 100.0 * float(share[table.edges("p_l")[:-1] >= high].sum())
+    assert low == 0.0 and high < 20.0 and 0.1 < longer <= 1.0
+    assert f"{longer:.2g} % is longer" in axes.get_title()
 
 
 def test_atoms_are_marked(tables):

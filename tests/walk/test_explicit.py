@@ -27,6 +27,7 @@ def test_sides(name: str, settings: dict, sides: int) -> None:
     assert len(found) == sides and len(set(found)) == sides
 
 
+@pytest.mark.slow
 def test_the_ray_engine_sees_the_same() -> None:
     """Packed salt that absorbs, in a sun: to the last bit as with a ray for each side that is met."""
     grains = (GrainSpec(SALT, absorption=Absorption("grey", (0.3,))),)

@@ -265,6 +265,7 @@ def test_which_meshes_are_convex(bumpy):
     assert not geometry.is_convex(geometry.Triangles(convex.vertices, convex.faces[1:]))
 
 
+@pytest.mark.slow
 def test_who_leaves_a_lone_convex_mesh_asks_no_more(tmp_path, table):
     """The ray engine is asked for what the camera sees and hardly more, the furnace is 1; where there is a surface, or
     a dent, it is asked as it must be."""
@@ -347,6 +348,7 @@ def test_media_that_touch_keep_to_themselves(table, tmp_path):
     assert means[0] < 0.95 and abs(means[0] - means[1]) < 0.03  # standard errors of .005; it was .08
 
 
+@pytest.mark.slow
 def test_media_that_overlap_a_little_are_all_there(table, tmp_path):
     """By less than is refused, where the grid has a mark: the second is there beyond it."""
     shapes = boxes(tmp_path, ((-1.0, -0.5, -0.5), (0.0054, 0.5, 0.5)), ((0.0049, -0.5, -0.5), (1.0, 0.5, 0.5)))

@@ -96,6 +96,7 @@ def test_as_the_ray_engine() -> None:
     assert same.mean() > 0.999
 
 
+@pytest.mark.slow
 def test_none_slips_through_edges() -> None:
     """From within a closed mesh, rays at the very vertices and at middles of edges leave through some facet."""
     corners = ball()

@@ -511,6 +511,7 @@ def test_grains_stand_where_they_should(ball: Table, tmp_path: Path, kind: str, 
 # ---------------------------------------------------------------------------------------------- lights
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "level", ["teleport", "teleport-joint", "teleport-memory", "volume", "volume-hg", "isotropic", "explicit"]
 )

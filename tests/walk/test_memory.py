@@ -99,6 +99,7 @@ def test_light_keeps_to_the_plane_of_a_sphere(ball: Table) -> None:
     assert np.abs(records[..., 6] - b).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_records_for_aimed_light_are_of_their_column(cube: Table) -> None:
     """Where a column of cos theta has records, those that stand for it lie in it, by the light that they are."""
     k = len(cube.memory["l"])

@@ -191,9 +191,12 @@ def _rounded_polytope(u: Floats, normals: Floats, heights: Floats, radius: Float
     """
     slope = np.maximum(u @ normals.T, 0)
     r = (heights / np.maximum(slope, 1e-9)).min(axis=1)  # the sharp polytope is outside: Newton comes down
+    moving = np.arange(len(r))
     for _ in range(30):
-        excess = np.maximum(0, r[:, None] * slope - heights + radius[:, None])
-        r = r - ((excess**2).sum(axis=1) - radius**2) / (2 * (excess * slope).sum(axis=1))
+        before, at, within = r[moving], slope[moving], radius[moving]
+        excess = np.maximum(0, before[:, None] * at - heights + within[:, None])
+        r[moving] = before - ((excess**2).sum(axis=1) - within**2) / (2 * (excess * at).sum(axis=1))
+        moving = moving[r[moving] != before]
     return r
 
 

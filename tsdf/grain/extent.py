@@ -10,11 +10,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from tsdf.simplex import least as least_of
+
 Floats = NDArray[np.float64]
 
 DIRECTIONS, TURNS = 300, 24  # from which the search for a sieve starts
 STARTS = 8  # of these, from which it goes on
-TOLERANCE = {"xatol": 1e-7, "fatol": 1e-9}  # where a search ends [rad, R]
+ENDS = 1e-7, 1e-9, 600  # of a search: so near [rad] and alike [R], or after so many steps
 MANY, NEAR = 4096, 0.1  # vertices of a body like a ball, and how near [R] they stand to the opposite, if few are asked
 BLOCK = 1024  # its square is how many distances are held at once
 ALIKE = 512  # directions whose extreme vertices stand for all where a search starts
@@ -61,8 +63,6 @@ def sieve(vertices: Floats) -> float:
     vertices : (n, 3) float64
         Of the body.
     """
-    from scipy.optimize import minimize
-
     few = _extremes(vertices)
     angles = np.arange(TURNS) * (0.5 * math.pi / TURNS)
     first = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(TURNS)])
@@ -72,7 +72,7 @@ def sieve(vertices: Floats) -> float:
         """Return the hole that points, turned so that they move along z, need at each angle, (TURNS,)."""
         return np.maximum(np.ptp(turned @ first.T, axis=0), np.ptp(turned @ second.T, axis=0))
 
-    def hole(turn: Floats, start: Floats, across: Floats) -> float:
+    def hole(turn: list[float], start: Floats, across: Floats) -> float:
         """Return the hole that points, (3, k), need which move across two directions (3, 2) that are turned."""
         along = (_rotation(turn) @ start).T @ across
         return float((along.max(axis=1) - along.min(axis=1)).max())
@@ -84,13 +84,11 @@ def sieve(vertices: Floats) -> float:
     for k in best:
         at = found[k].argmin()
         start = ways[k] @ np.column_stack([first[at], second[at]])
-        turn, size, missed = np.zeros(3), 0.05, True
+        turn, size, missed = [0.0, 0.0, 0.0], 0.05, True
         while missed:
             across = np.ascontiguousarray(few.T)
-            simplex = turn + size * np.vstack([np.zeros(3), np.eye(3)])
-            there = minimize(partial(hole, start=start, across=across), turn, method="Nelder-Mead",
-                             options={"initial_simplex": simplex, **TOLERANCE})  # fmt: skip
-            turn, narrowest = there.x, float(there.fun)
+            simplex = (turn + size * np.vstack([np.zeros(3), np.eye(3)])).tolist()
+            turn, narrowest = least_of(partial(hole, start=start, across=across), simplex, *ENDS)
             size = 0.005
             along = vertices @ (_rotation(turn) @ start)
             width = float(np.ptp(along, axis=0).max())
@@ -110,9 +108,9 @@ def _frames(d: Floats) -> Floats:
     return np.stack([u, np.cross(d, u), d], axis=2)
 
 
-def _rotation(turn: Floats) -> Floats:
+def _rotation(turn: list[float]) -> Floats:
     """Return the rotation (3, 3) by a vector: about it, by its length [rad] (Rodrigues)."""
-    x, y, z = turn.tolist()  # thousands are asked for, one by one
+    x, y, z = turn
     square = x * x + y * y + z * z
     if square < 1e-24:
         c, s = 0.5, 1.0

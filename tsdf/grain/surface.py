@@ -1,7 +1,8 @@
 """Closed surfaces: weld, close, orient and judge the triangles of a grain, and find their minimal bounding sphere.
 
-Geometry on arrays of points and faces, with numpy and scipy alone. Where the arrays come from and what is made of them
-is `grains`. Lengths are in units of about R, so that tolerances mean the same for a grain of any size.
+Geometry on arrays of points and faces, with numpy alone, but for vertices that must be welded. Where the arrays come
+from and what is made of them is `grains`. Lengths are in units of about R, so that tolerances mean the same for a grain
+of any size.
 """
 
 import hashlib
@@ -53,14 +54,26 @@ def equal_vertices(points: Floats) -> Ints:
 
 def _near_vertices(points: Floats, among: Ints) -> Ints:
     """Return for each vertex the first one within `NEAR_WELD` of it, linked through vertices `among` only."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
     pairs = among[cKDTree(points[among]).query_pairs(NEAR_WELD, output_type="ndarray")]
-    n = len(points)
-    _, label = connected_components(coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (n, n)))
-    return np.unique(label, return_index=True)[1][label]
+    return connected(len(points), pairs[:, 0], pairs[:, 1])
+
+
+def connected(count: int, one: Ints, other: Ints) -> Ints:
+    """Return for each of `count` things the first of all that are linked with it, by links (k,) from one to the other.
+
+    Each round joins what is linked to the smallest neighbour of all: a handful of rounds, and nothing to import.
+    """
+    first = np.arange(count)
+    while len(one):
+        here, there = first[one], first[other]
+        apart = here != there
+        one, other = np.minimum(here, there)[apart], np.maximum(here, there)[apart]
+        np.minimum.at(first, other, one)
+        while (first != (ahead := first[first])).any():
+            first = ahead
+    return first
 
 
 def half_edges(faces: Ints) -> tuple[Ints, Ints, Ints]:
@@ -137,16 +150,13 @@ def _wound(faces: Ints, pairs: Ints) -> tuple[NDArray[np.bool_] | None, Ints]:
     Each face stands twice in a graph, as it is and turned over; neighbours are joined in the states that
     agree. A shell is then two components, one for each side, or one if the surface has one side only: None.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     m = len(faces)
     start = faces.reshape(-1)  # of each half-edge
     first, second = pairs.T
     alike = start[first] == start[second]  # both run along the edge in one direction: one must turn over
     f, g = first // 3, second // 3
     rows, columns = np.r_[f, f + m], np.r_[g + m * alike, g + m * ~alike]
-    _, label = connected_components(coo_array((np.ones(len(rows), np.int8), (rows, columns)), (2 * m, 2 * m)))
+    label = connected(2 * m, rows, columns)
     kept, turned = label[:m], label[m:]
     shell = np.unique(np.minimum(kept, turned), return_inverse=True)[1]
     if (kept == turned).any():
@@ -225,17 +235,12 @@ def _inside_out(points: Floats, faces: Ints, whole: Ints) -> NDArray[np.bool_]:
 
 def _own_vertices(points: Floats, faces: Ints, pairs: Ints) -> tuple[Floats, Ints]:
     """Return the mesh with one vertex for the corners that pairs (k, 2) of half-edges join, and no others."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     corner = faces.reshape(-1)
     ends = np.stack([pairs, pairs - pairs % 3 + (pairs % 3 + 1) % 3], axis=2)  # corners at both ends of each
     same = (corner[ends[:, 0, 0]] == corner[ends[:, 1, 0]])[:, None]
     left, right = ends[:, 0], np.where(same, ends[:, 1], ends[:, 1, ::-1])
     rows, columns = left.ravel(), right.ravel()
-    n = len(corner)
-    _, label = connected_components(coo_array((np.ones(len(rows), np.int8), (rows, columns)), (n, n)))
-    _, first, index = np.unique(label, return_index=True, return_inverse=True)
+    first, index = np.unique(connected(len(corner), rows, columns), return_inverse=True)
     return points[corner[first]], index.reshape(-1, 3)
 
 

@@ -181,6 +181,8 @@ def judge_records(gavel: Gavel, t: Subject) -> None:
         values = joint[name].astype(np.float64)
         if block == "p_phi":
             values = np.where(values < edges[0], values + 2.0 * math.pi, values)
+        if block == "p_z":
+            values = values + 1e-9  # a reflection, z = 0, may be a rounding error less, and counts in the cell above
         cell = np.searchsorted(edges, values, side="right").astype(np.int32) - 1  # there may be many
         np.clip(cell, 0, len(masses) - 1, out=cell)
         if block == "p_l":

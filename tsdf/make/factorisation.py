@@ -2,10 +2,12 @@
 
 import math
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
+from tsdf import simplex
 from tsdf.judge import analytic
 from tsdf.make import tally as T
 from tsdf.make.statistics import each, product, ratio
@@ -105,8 +107,6 @@ def fits(p_theta: np.ndarray, edges: np.ndarray, mean_cosine: float) -> dict[str
     diffuses as far as with the table itself. Lobes have no atoms: those of the table count in the cells beside them,
     so that a lobe of g near 1 may stand for one.
     """
-    from scipy.optimize import minimize
-
     smeared = p_theta[1:-1].copy()
     smeared[0] += p_theta[0]
     smeared[-1] += p_theta[-1]
@@ -118,24 +118,21 @@ def fits(p_theta: np.ndarray, edges: np.ndarray, mean_cosine: float) -> dict[str
     limit = 0.9999
     g = min(max(mean_cosine, -limit), limit)
 
-    def lobes(x: np.ndarray) -> tuple[float, float, float]:
+    def lobes(x: list[float]) -> tuple[float, float, float]:
         narrow = g + (limit - g) / (1.0 + math.exp(-x[0]))
         wide = g - (limit + g) / (1.0 + math.exp(-x[1]))
         return narrow, wide, (g - wide) / (narrow - wide) if narrow > wide else 1.0
 
-    def both(x: np.ndarray) -> float:
+    def both(x: list[float]) -> float:
         narrow, wide, weight = lobes(x)
         first, second = analytic.henyey_greenstein(narrow, edges), analytic.henyey_greenstein(wide, edges)
         return variation(weight * first + (1.0 - weight) * second)
 
-    starts = [np.array((a, b)) for a in (-2.0, 0.0, 2.0, 8.0) for b in (-2.0, 0.0, 2.0)]
-    options = {"xatol": 1e-4, "fatol": 1e-7, "maxiter": 400}
-    best = min(
-        (minimize(both, start, method="Nelder-Mead", options=options) for start in starts),
-        key=lambda result: result.fun,
-    )
-    narrow, wide, weight = lobes(best.x)
+    starts = [(a, b) for a in (-2.0, 0.0, 2.0, 8.0) for b in (-2.0, 0.0, 2.0)]
+    found = (simplex.least(both, simplex.around(start), 1e-4, 1e-7, 400) for start in starts)
+    best, least = min(found, key=itemgetter(1))
+    narrow, wide, weight = lobes(best)
     return {
         "henyey_greenstein": {"g": g, "total_variation": variation(analytic.henyey_greenstein(g, edges))},
-        "two_lobe": {"g1": narrow, "g2": wide, "weight": weight, "total_variation": float(best.fun)},
+        "two_lobe": {"g1": narrow, "g2": wide, "weight": weight, "total_variation": least},
     }

@@ -89,6 +89,7 @@ class Build:
     tally: Tally
     done: Spans = field(default_factory=list)
     judgement: int = CHUNK_MIN
+    _judged: tuple[int, statistics.TableErrors] | None = None  # at so many paths
     _latest: tuple[int, statistics.TableError] | None = None
     _sought: Future[dict[str, float]] | None = None  # of the grain's header, what takes a search
 
@@ -163,9 +164,16 @@ class Build:
         if not self.tally.scalars[:, T.SCATTERED].any():
             return None
         if self._latest is None or self._latest[0] != self.paths:
-            errors, target = statistics.TableErrors(self.tally, self.effort.cells), self.effort.target_error
+            errors, target = self._errors(), self.effort.target_error
             self._latest = self.paths, (errors.fewest(target) if target is not None else None) or errors.best()
+            self._judged = None  # 25 MB
         return self._latest[1]
+
+    def _errors(self) -> statistics.TableErrors:
+        """Return the errors of the tables that would be made now."""
+        if self._judged is None or self._judged[0] != self.paths:
+            self._judged = self.paths, statistics.TableErrors(self.tally, self.effort.cells)
+        return self._judged[1]
 
     def _judge(self, progress: Progress) -> bool:
         """Tell whether the target is met, and if not, choose when to ask again: never so late that much is wasted.
@@ -181,12 +189,11 @@ class Build:
         self.judgement = following
         if not self.tally.scalars[:, T.SCATTERED].all():
             return False
-        errors = statistics.TableErrors(self.tally, self.effort.cells)
-        progress.error = errors.fewest(target) or errors.rough()
-        if progress.error.total_variation <= target:
-            self._latest = paths, progress.error
+        errors = self._errors()
+        if errors.meets(target):  # with how few cells is found out when the threads have stopped
             progress.total = self.judgement = paths
             return True
+        progress.error = errors.rough()
         least, needed = (times * paths for times in errors.needed(target))
         sure = progress.error.sampling_noise < 0.5 * target
         if math.isinf(least) or (sure and least > REASONABLE):
@@ -331,17 +338,22 @@ class Build:
                     progress.error = self.error()
                 self.check_leaks()
                 if part_file is not None and now - saved > SAVE_S:
-                    self.save(part_file)
+                    self.save(part_file, whole=self._whole(part))
                     saved = time.monotonic()
+        if target is not None and self.judgement == self.paths:  # it is met
+            progress.error = self.error()
         if part_file is not None and (self.done or not leave.is_set()):
-            self.save(part_file)
+            self.save(part_file, whole=not leave.is_set() or self._whole(part))
 
     def _complete(self, part: tuple[int, int], part_file: Path | None, progress: Progress, deadline: float) -> bool:
         """Return whether nothing is to be traced: all is done, and meets the target, or it is too late for more."""
         if self.done and deadline <= time.monotonic():
             return True
-        whole = without(self._wanted(part), self.done) == []
-        return whole and (self.effort.target_error is None or self._judge_and_save(progress, part_file))
+        return self._whole(part) and (self.effort.target_error is None or self._judge_and_save(progress, part_file))
+
+    def _whole(self, part: tuple[int, int]) -> bool:
+        """Return whether no path is missing."""
+        return without(self._wanted(part), self.done) == []
 
     def _left(self, part: tuple[int, int], ahead: Spans) -> Spans:
         """Return which paths are wanted beside those `ahead`; more than the target needs while it is judged."""
@@ -428,15 +440,22 @@ class Build:
         tally = self.tally.narrowed(made.joint, made.memory)
         return assemble.traced_table(tally, error.cells, self.grain, self.optics, provenance, made.memory)
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path, whole: bool = True) -> None:
         """Write the part file, atomically.
+
+        Parameters
+        ----------
+        whole : bool
+            Whether a table may be made of it without the mesh: then what is still sought is waited for, of a huge mesh
+            some seconds.
 
         Raises
         ------
         TSDFError
             If it cannot be written; the file that stood there is left as it was.
         """
-        self._find()
+        if whole:
+            self._find()
         request = json.dumps({**self.origin, "effort": asdict(self.effort), "judgement": self.judgement})
         kept: dict[str, np.ndarray] = {
             archive.PART: np.frombuffer(request.encode(), dtype=np.uint8),

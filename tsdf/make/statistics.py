@@ -12,13 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tsdf.compiled import njit
 from tsdf.make import tally as T
 from tsdf.make.tally import Tally
+from tsdf.vectors import KERNEL
 
 LEGENDRE = 16  # highest Legendre moment in the header
 MIN_CELLS, MAX_CELLS = 8, T.COARSE
 HAZE = 0.3  # share of the noise that a cell width may be too large by
-FEW = 4  # numbers that are summed one by one
+FEW = 8  # numbers that numpy, too, sums one by one
 NEAR = 1.3  # errors an octave of cells beside the least are no larger than so many times it
 STATISTICS = (
     "hit_probability",
@@ -154,6 +156,7 @@ class TableErrors:
         self._theta = tally.theta * (len(tally.theta) / tally.scalars[:, T.SCATTERED].sum())
         self._candidates = candidate_cells() if cells is None else [cells]
         self._known: dict[int, TableError] = {}
+        self._sums: dict[bytes, np.ndarray] = {}
 
     def __call__(self, cells: int) -> TableError:
         """Return the error in so many cells."""
@@ -163,13 +166,14 @@ class TableErrors:
 
     def _estimate(self, cells: int) -> TableError:
         theta, replicates = self._theta, len(self._theta)
-        columns = columns_of(theta, cells)
+        sums = self._parts(cells, 1)[1]
+        columns = np.concatenate((theta[:, T.FINE + 1 :], sums[:, ::-1], theta[:, T.FINE : T.FINE + 1]), axis=1)
         noise = columns.std(axis=0, ddof=1).sum()
         widths: list[float] = []
         for parts in (2, 4, 8, 16):
             if parts * cells > T.FINE:
                 break
-            width, blur = _width(theta[:, : T.FINE], columns[:, -2:0:-1], parts)
+            width, blur = _width(*self._parts(cells, parts), sums)
             if widths and blur > 1.5 * width:
                 break
             widths.append(width)
@@ -177,6 +181,18 @@ class TableErrors:
         # the root of their width, the gains of ever finer parts add up to 2.4 times the last
         hidden = 2.4 * max(0.0, widths[-1] - widths[-2]) if len(widths) > 1 else 0.0
         return TableError(cells, float(noise * math.sqrt(0.5 / (math.pi * replicates))), widths[-1] + hidden)
+
+    def _parts(self, cells: int, parts: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return where `parts` nearly equal parts of each of so many cells begin and end, and the sums over them,
+        (replicates, cells * parts); cells an octave apart share them."""
+        edges = bounds(cells, T.FINE)
+        cuts = np.append(
+            np.rint(np.linspace(edges[:-1], edges[1:], parts, endpoint=False)).astype(int).T.ravel(), T.FINE
+        )
+        key = cuts.tobytes()
+        if key not in self._sums:
+            self._sums[key] = _between(self._theta, cuts)
+        return cuts, self._sums[key]
 
     def rough(self) -> TableError:
         """Return the least error of candidates an octave apart, from the finest on to where errors rise again."""
@@ -195,9 +211,13 @@ class TableErrors:
             best = min((i for i in (best - step, best, best + step) if 0 <= i <= last), key=self._variation)
         return self(self._candidates[best])
 
+    def meets(self, target: float) -> bool:
+        """Return whether some number of cells meets a target."""
+        return self.rough().total_variation <= NEAR * target and self.best().total_variation <= target
+
     def fewest(self, target: float) -> TableError | None:
         """Return the error of the fewest cells that meet a target, by bisection, or None if none does."""
-        if self.rough().total_variation > NEAR * target or self.best().total_variation > target:
+        if not self.meets(target):
             return None
         low, high = -1, self._candidates.index(self.best().cells)
         while high - low > 1:
@@ -229,25 +249,24 @@ class TableErrors:
         return least, math.sqrt(least * most) if math.isfinite(most) else least
 
 
-def _width(theta: np.ndarray, sums: np.ndarray, parts: int) -> tuple[float, float]:
-    """Return the total variation between columns and their `parts` nearly equal parts, and the parts' noise.
+def _width(cuts: np.ndarray, finer: np.ndarray, sums: np.ndarray) -> tuple[float, float]:
+    """Return the total variation between columns and their nearly equal parts, and the parts' noise.
 
     Parameters
     ----------
-    theta : (replicates, FINE) float64
+    cuts : (cells * parts + 1,) int64
+        Where the parts begin and end, in fine cells.
+    finer : (replicates, cells * parts) float64
+        What is in each part.
     sums : (replicates, cells) float64
-        Of `theta` over each column.
+        What is in each column.
     """
-    replicates, cells = sums.shape
-    edges = bounds(cells, T.FINE)
-    cuts = np.append(np.rint(np.linspace(edges[:-1], edges[1:], parts, endpoint=False)).astype(int).T.ravel(), T.FINE)
-    deviations = _between(theta, cuts).reshape(replicates, cells, parts)
+    cells = sums.shape[1]
+    parts = finer.shape[1] // cells
     share = np.diff(-np.cos(cuts * (math.pi / T.FINE))).reshape(cells, parts)
     share /= share.sum(axis=1, keepdims=True)  # the density of the table is uniform in cos theta within a column
-    deviations -= sums[:, :, None] * share
-    mean = deviations.mean(axis=0)
-    deviations -= mean
-    variances = np.square(deviations, out=deviations).sum(axis=0) / ((replicates - 1) * replicates)
+    mean, variances = found = np.zeros((2, cells, parts))
+    _deviations(finer.reshape(-1, cells, parts), sums, share, found)
     squares = mean**2 - variances
     # the noise of a square is known and subtracted: part by part in columns that clearly deviate, which leaves a
     # little too much elsewhere, so there over a window of columns if that leaves less
@@ -259,28 +278,64 @@ def _width(theta: np.ndarray, sums: np.ndarray, parts: int) -> tuple[float, floa
     return float(width), float(np.sqrt(variances).sum() * math.sqrt(0.5 / math.pi))
 
 
+@njit(**KERNEL)
+def _deviations(finer: np.ndarray, sums: np.ndarray, share: np.ndarray, found: np.ndarray) -> None:
+    """Write the mean over replicates of what parts have beside their share of sums, and the variance of that mean.
+
+    finer (replicates, cells, parts); sums (replicates, cells); share (cells, parts); found (2, cells, parts), zeros.
+    One row after the other, as numpy would add them.
+    """
+    replicates, cells, parts = finer.shape
+    mean, variances = found[0], found[1]
+    for r in range(replicates):
+        for c in range(cells):
+            for k in range(parts):
+                mean[c, k] += finer[r, c, k] - sums[r, c] * share[c, k]
+    mean /= replicates
+    for r in range(replicates):
+        for c in range(cells):
+            for k in range(parts):
+                deviation = finer[r, c, k] - sums[r, c] * share[c, k] - mean[c, k]
+                variances[c, k] += deviation * deviation
+    variances /= (replicates - 1) * replicates
+
+
 def _between(values: np.ndarray, cuts: np.ndarray) -> np.ndarray:
     """Return the sums of (n, m) values from each cut to the next, to the last bit those of ``np.add.reduceat``, which
     takes several times as long where there are few between cuts."""
-    size = int(cuts[1] - cuts[0])
-    if size > FEW or (np.diff(cuts) != size).any():
-        return np.add.reduceat(values, cuts[:-1], axis=1)
-    if size == 1:
-        return values.copy()
-    rest = values[:, 1::size]  # all but the first, which is added last
-    for k in range(2, size):
-        rest = rest + values[:, k::size]
-    return values[:, ::size] + rest
+    sizes = np.diff(cuts)
+    size = int(sizes[0])
+    if sizes.max() > FEW:
+        return np.add.reduceat(values[:, : cuts[-1]], cuts[:-1], axis=1)
+    if size < 3 and (sizes == size).all():
+        values = values[:, : cuts[-1]]
+        return values.copy() if size == 1 else values[:, ::2] + values[:, 1::2]
+    out = np.empty((len(values), len(sizes)))
+    _sum_between(values, cuts, out)
+    return out
+
+
+@njit(**KERNEL)
+def _sum_between(values: np.ndarray, cuts: np.ndarray, out: np.ndarray) -> None:
+    """Write the sums of `FEW` values at most from each cut to the next into `out`: all but the first, which is added
+    last."""
+    for i in range(len(values)):
+        for k in range(len(cuts) - 1):
+            rest = 0.0
+            for j in range(cuts[k] + 1, cuts[k + 1]):
+                rest += values[i, j]
+            out[i, k] = values[i, cuts[k]] + rest
 
 
 def _pooled(values: np.ndarray, window: int) -> np.ndarray:
     """Return the mean of the values around each, as many as there are up to `window`."""
-    before = (window - 1) // 2
-    padded = np.pad(np.stack((values, np.ones(len(values)))), ((0, 0), (window - 1 - before, before)))
-    sums = np.zeros((2, len(values)))
-    for k in range(window):
-        sums += padded[:, k : k + len(values)]
-    return sums[0] / sums[1]
+    count, before = len(values), (window - 1) // 2
+    sums, numbers = np.zeros(count), np.zeros(count)
+    for k in range(before + 1 - window, before + 1):  # from the first to the last of those around
+        here, there = slice(max(0, -k), count - max(0, k)), slice(max(0, k), count - max(0, -k))
+        sums[here] += values[there]
+        numbers[here] += 1.0
+    return sums / numbers
 
 
 def candidate_cells() -> list[int]:

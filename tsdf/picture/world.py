@@ -295,7 +295,9 @@ def build(
         if 2.0 * medium.radius > extent and medium.inside == "grains":
             notes.append(
                 f"{scene.name}: {called('medium', number, medium.name)}: a grain of diameter {2.0 * medium.radius:g} "
-                f"does not fit into the medium, which is {extent:.3g} thin"
+                f"does not fit into the medium, which is {extent:.3g} thin: "
+                + ("no grain is there" if singles else "it is filled as if with smaller grains")
+                + '; take smaller grains, or inside = "centres"'
             )
     lights, said = _lights(scene)
     compiled = compile_tables(tables or [_no_table()], joint=traits.joint)

@@ -33,6 +33,7 @@ FORGETS = "memory.md, How right it is"
 FORGETFUL = {"teleport-joint": FORGETS, "teleport": FORGETS, "volume": FORGETS}
 BACK = "memory.md, What it cannot know"
 PATHS = 600_000  # of each level; of explicit twice as many
+PACKINGS = 4  # of levels of single grains; of the truth of some slabs more, where how grains lie is most of its error
 
 
 class Case(NamedTuple):
@@ -44,6 +45,7 @@ class Case(NamedTuple):
     cosine: float = 1.0
     absorption: float = 0.0
     times: int = 1  # as many paths as else
+    packings: int = PACKINGS  # of the truth
 
 
 def grain_of(setting: Setting, name: str) -> GrainSpec:
@@ -94,8 +96,8 @@ def experiment(setting: Setting, method: str, case: Case, packing: int = 0, top:
 
 def reflected(setting: Setting, method: str, case: Case, number: int) -> tuple[float, float]:
     """Return the reflectance of a slab and its standard error, of packed grains over packings and places in them."""
-    several = method in PACKED
-    packings = range(2 if setting.quick else 4) if several else (0,)
+    several, whole = method in PACKED, case.packings if method == "explicit" else PACKINGS
+    packings = range(2 if setting.quick else whole) if several else (0,)
     places = [
         (k, top)
         for k in packings
@@ -188,28 +190,52 @@ def _slab(
 
 
 ROWS = (
-    _slab("thin", "layer of 2 R", Case("ball", 0.6, 2.0, times=3), 6.0),
-    _slab("monolayer", "layer of .5 R, light at 60 degrees", Case("ball", 0.6, 0.5, 0.5, times=2), 12.0, quick=False),
-    _slab("thin-60", "layer of 2 R, light at 60 degrees", Case("ball", 0.6, 2.0, 0.5), 6.0, quick=False),
-    _slab("thin-4", "layer of 4 R, light at 60 degrees", Case("ball", 0.6, 4.0, 0.5), 4.0, quick=False),
+    _slab("thin", "layer of 2 R", Case("ball", 0.6, 2.0, times=3, packings=32), 6.0),
+    _slab(
+        "monolayer",
+        "layer of .5 R, light at 60 degrees",
+        Case("ball", 0.6, 0.5, 0.5, times=2, packings=16),
+        12.0,
+        quick=False,
+    ),
+    _slab(
+        "thin-60",
+        "layer of 2 R, light at 60 degrees",
+        Case("ball", 0.6, 2.0, 0.5, times=2, packings=32),
+        6.0,
+        quick=False,
+    ),
+    _slab("thin-4", "layer of 4 R, light at 60 degrees", Case("ball", 0.6, 4.0, 0.5, packings=16), 4.0, quick=False),
     _slab("grazing", "layer of 10 R, sun 5 degrees high", Case("ball", 0.6, 10.0, math.sin(math.radians(5.0))), 4.0),
     _slab("f-01", "layer of 40 R, f = .01", Case("ball", 0.01, 40.0, times=2), 12.0, {}),
-    _slab("f-30", "layer of 10 R, f = .3", Case("ball", 0.3, 10.0), 4.0, {}, quick=False),
+    _slab("f-30", "layer of 10 R, f = .3", Case("ball", 0.3, 10.0, times=2, packings=16), 4.0, {}, quick=False),
     _slab("f-64", "layer of 10 R, f = .64", Case("ball", 0.64, 10.0), 4.0, quick=False),
-    _slab("f-57", "layer of 10 R, f = .57, between those tabulated", Case("ball", 0.57, 10.0), 3.0, quick=False),
+    _slab(
+        "f-57",
+        "layer of 10 R, f = .57, between those tabulated",
+        Case("ball", 0.57, 10.0, times=2, packings=16),
+        3.0,
+        quick=False,
+    ),
     _slab("deep", "layer of 40 R, f = .6", Case("ball", 0.6, 40.0), 2.0, quick=False),
     _slab("dark", "layer of 10 R, light that gets in is absorbed", Case("ball", 0.6, 10.0, 1.0, 50.0, 4), 12.0),
     _slab("mirrors", "layer of 10 R of mirrors", Case("mirror", 0.6, 10.0), 2.0),
     _slab(
         "eta-102",
         "layer of 40 R, eta = 1.02",
-        Case("nearly", 0.6, 40.0, times=2),
+        Case("nearly", 0.6, 40.0, times=10, packings=16),
         6.0,
         FORGETFUL,
         False,
     ),
     _slab("facets-traced", "layer of 10 R of cubes, eta = 1.31", Case("cube", 0.6, 10.0), 4.0, {}, quick=False),
-    _slab("bubbles", "layer of 10 R of bubbles, eta = .75", Case("bubble", 0.6, 10.0), 3.0, quick=False),
+    _slab(
+        "bubbles",
+        "layer of 10 R of bubbles, eta = .75",
+        Case("bubble", 0.6, 10.0, times=2, packings=16),
+        3.0,
+        quick=False,
+    ),
     _slab(
         "plates", "layer of 10 R of plates, half of which are missed", Case("plates", 0.6, 10.0), 4.0, {}, quick=False
     ),

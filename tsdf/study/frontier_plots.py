@@ -21,6 +21,7 @@ LINES: Any = ("-", "--", ":", "-.")  # by the number of explicit grains, fewest 
 WIDTHS = (1.1, 2.4, 0.5)  # of lines, by the least radius of leaps, as the scene says first
 ONWARD = 30.0  # how much farther than the measured times a line goes
 COLUMNS = 3  # of charts beside each other
+MOST_NAMED = 14  # candidates that can all be named beside a chart
 STEPS = {1.2: (1.0, 1.5, 2.0, 3.0, 5.0, 7.0), 2.2: (1.0, 2.0, 5.0), 3.5: (1.0, 3.0)}  # of a decade, by decades shown
 
 
@@ -33,11 +34,13 @@ def plot_frontier(frontier: Frontier) -> Any:
         figure = Figure(figsize=(11.0, 5.2), layout="constrained")
         left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
         _against_time(left, frontier)
-        _names(left, frontier)
+        chosen = named(frontier, *left.get_xlim())
+        _names(left, frontier, chosen)
         _against_bytes(right, frontier)
+        few = f"; {len(chosen)} of {len(frontier.rows)} named: the best of each time, of each level"
         figure.suptitle(
             f"{_title(frontier)}: error to {frontier.truth}, {frontier.runs} runs, "
-            f"{frontier.width} x {frontier.height} pixels", fontsize=10
+            f"{frontier.width} x {frontier.height} pixels{few if len(chosen) < len(frontier.rows) else ''}", fontsize=10
         )  # fmt: skip
         figure.legend(handles=_keys([frontier]), loc="outside lower center", ncols=6, frameon=False, handlelength=2.4)
     return figure
@@ -100,10 +103,28 @@ def _against_time(axes: Any, frontier: Frontier) -> None:
     axes.set_ylabel("error of pixels, over the mean [%]")
 
 
-def _names(axes: Any, frontier: Frontier) -> None:
+def named(frontier: Frontier, low: float, high: float) -> list[Measured]:
+    """Return the candidates whose names a chart from `low` to `high` seconds has room for: all, or if they are many
+    those that have the least error at some time, and of each level the one with the least floor.
+    """
+    rows = frontier.rows
+    if len(rows) <= MOST_NAMED:
+        return list(rows)
+    noise, floors = (
+        np.array(of)[:, None]
+        for of in ([mean_of(r.noise_seconds).value for r in rows], [frontier.floor(r).value for r in rows])
+    )
+    errors = np.sqrt(floors**2 + noise / np.geomspace(low, high, 200))
+    chosen = set(errors.argmin(axis=0).tolist())
+    for level in {row.candidate.level for row in rows}:
+        chosen.add(min((k for k, r in enumerate(rows) if r.candidate.level == level), key=lambda k: floors[k, 0]))
+    return [row for k, row in enumerate(rows) if k in chosen]
+
+
+def _names(axes: Any, frontier: Frontier, rows: Sequence[Measured]) -> None:
     """Name the lines beside the axes, with their floors, pushed apart where they are close."""
     bottom, top = axes.get_ylim()
-    ends = [100.0 * frontier.floor(row).value for row in frontier.rows]
+    ends = [100.0 * frontier.floor(row).value for row in rows]
     heights = [math.log(max(end, bottom) / bottom) / math.log(top / bottom) for end in ends]
     order = np.argsort(heights, kind="stable")
     step = min(0.05, 1.0 / max(1, len(order) - 1))
@@ -115,7 +136,7 @@ def _names(axes: Any, frontier: Frontier) -> None:
         if over > 0.0:
             placed[k] = min(placed[k], height := min(height, 1.0))
             height -= step
-    for k, row in enumerate(frontier.rows):
+    for k, row in enumerate(rows):
         value, seen = 100.0 * row.floor.value, row.floor.seen
         half = 50.0 * mean_of(row.squares).error / max(row.floor.value, 1e-300)
         word = "the truth" if frontier.exact(row) else f"{value:.2g} ± {half:.1g} %" if seen else f"< {value:.2g} %"

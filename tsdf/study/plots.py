@@ -26,7 +26,7 @@ SUFFIXES = (".png", ".pdf", ".svg")
 DPI = 160
 DECADES = 3.0  # range of the colours below the largest density
 DENSEST = 1e30  # density shown; cells may be as narrow as numbers are
-SHOWN = 0.999  # share of the light whose path lengths are in the picture
+SHOWN = 0.99  # share of the light whose path lengths are in the picture: the last thousandth of quartz is 384 R long
 STRIP = (0.05, 0.10)  # distance from the axis and width of an atom's strip [cos theta]
 STYLE: Any = {
     "font.family": "DejaVu Sans",
@@ -290,7 +290,8 @@ def plot_preview(found: Preview, notes: Sequence[str]) -> Any:
             axes.set_axis_off()
         for axes, panel in zip(grid.flat, found.panels, strict=False):
             axes.imshow(panel.rgb, interpolation="bilinear", aspect="equal")
-            axes.set_title(panel.title)
+            noise = f", noise {100.0 * panel.error:.2g} %" if math.isfinite(panel.error) else ""
+            axes.set_title(f"{panel.title}{noise}")
             bold = {"transform": axes.transAxes, "va": "top", "weight": "bold", "fontsize": 8.0}
             axes.text(0.0, -0.03, str(panel.advice), **bold)
             why = textwrap.wrap(panel.advice.reason, 62) + textwrap.wrap(panel.drawn, 62)
@@ -386,6 +387,8 @@ def _conditional(figure: Any, axes: Any, table: Table, name: str, label: str, ti
         title += rf", {100.0 * outside:.3g} % never enters"
         share = np.cumsum(masses @ table.p_theta)
         last = int(np.searchsorted(share, SHOWN * share[-1])) + 1
+        if (longer := 100.0 * float(share[-1] - share[last - 1])) > 5e-4:
+            title += f", {longer:.2g} % is longer"
         rows, masses = rows[1 : last + 1], masses[1:last]
     with np.errstate(over="ignore"):
         density = np.minimum(masses / np.diff(rows)[:, None], DENSEST)

@@ -279,15 +279,16 @@ def _shape(name: str, folder: Path) -> MediumShape:
 def _sky() -> np.ndarray:
     """Return the sky (h, w, 3): brighter towards the top, with a window before the things, on the right.
 
-    It is too broad and dim for the renderer to aim at it: what finds it by chance has less noise, and is faster.
+    It is too broad and dim for the renderer to aim at it: what finds it by chance has less noise, and is faster. It is
+    hardly thrice as bright as the sky: under one of six times white grains took four times as long to the same noise.
     """
     h, w = SKY
     up = np.sin(math.pi * (0.5 - (np.arange(h) + 0.5) / h))[:, None, None]
-    sky = np.where(up > 0.0, 0.2 + 0.25 * up, 0.12) * np.array([0.92, 0.98, 1.08]) * np.ones((h, w, 1))
+    sky = np.where(up > 0.0, 0.42 + 0.25 * up, 0.2) * np.array([0.92, 0.98, 1.08]) * np.ones((h, w, 1))
     azimuth = -360.0 * (np.arange(w) + 0.5) / w + 360.0  # falls with the column, from +x
     elevation = np.degrees(np.arcsin(up[:, 0, 0]))
     window = (np.abs(azimuth[None, :] - 305.0) < 50.0) & (np.abs(elevation[:, None] - 45.0) < 30.0)
-    sky[window] = [1.48, 1.4, 1.28]
+    sky[window] = [1.07, 1.01, 0.92]
     return sky
 
 
