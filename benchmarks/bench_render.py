@@ -301,6 +301,10 @@ def near(table: Table, rounds: int, spp: int, folder: Path) -> list[str]:
             made[f"ball of {len(mesh.faces)} facets, grains of {radius:g}, sun"] = world.build(
                 one, "teleport", leap=0.0
             )
+        bumps = np.sin(9.0 * mesh.vertices).prod(axis=1, keepdims=True)
+        trimesh.Trimesh(mesh.vertices * (1.0 + 0.1 * bumps), mesh.faces).export(folder / f"bumpy{subdivisions}.ply")
+        one = outlook(table, Mesh(folder / f"bumpy{subdivisions}.ply"), 1.0, 1e-1, sun)
+        made[f"bumpy ball of {len(mesh.faces)} facets, grains of 0.1, sun"] = world.build(one, "teleport", leap=0.0)
     for name, levels in SHIPPED.items():
         try:
             shipped = resized(load(SCENES / f"{name}.toml"), 160)
@@ -335,14 +339,18 @@ def cost(made: world.World, spp: int, seed: int) -> tuple[Picture, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="fewer rounds, fewer events")
+    parser.add_argument("--near", action="store_true", help="only the table near boundaries, on stdout")
     parser.add_argument("--out", type=Path, default=Path("bench"), help="folder for the results")
     given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
     rounds, many, seconds = (3, 1_000_000, 1.0) if given.quick else (5, 4_000_000, 3.0)
-    tables = {
-        "exact sphere": exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=256, joint=32, memory=MEMORY)),
-        "snow": built("snow", 200_000, 32, MEMORY),
-    }
+    sphere = exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=256, joint=32, memory=MEMORY))
+    spp = 4 if given.quick else 8
+    if given.near:
+        with tempfile.TemporaryDirectory() as folder:
+            print("\n".join(near(sphere, rounds, spp, Path(folder))))
+        return
+    given.out.mkdir(parents=True, exist_ok=True)
+    tables = {"exact sphere": sphere, "snow": built("snow", 200_000, 32, MEMORY)}
     text = [
         "# The renderer",
         "",
@@ -357,7 +365,7 @@ def main() -> None:
     table = faceted()
     with tempfile.TemporaryDirectory() as folder:
         lines, gain = equal_variance(table, rounds, seconds, Path(folder))
-        boundaries = near(tables["exact sphere"], rounds, 4 if given.quick else 8, Path(folder))
+        boundaries = near(sphere, rounds, spp, Path(folder))
     text += [
         "",
         f"## Multiply scattered light: a slab of {THICK:.0f} R, grains of 20,480 facets, one thread",

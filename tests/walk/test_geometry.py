@@ -23,6 +23,7 @@ from tsdf.scene.scene import (
     GrainSpec,
     MediumSpec,
     Mesh,
+    Rectangle,
     Scene,
     Slab,
     Sphere,
@@ -357,3 +358,32 @@ def test_media_that_overlap_a_little_are_all_there(table, tmp_path):
     made = world.build(Scene(camera, (ConstantLight((1.0, 1.0, 1.0)),), media, (surface,), name="o"), "volume")
     picture = render.render(made, spp=4)
     assert picture.events > 20 * picture.samples.sum()
+
+
+def test_more_media_than_can_be_told_apart_are_refused(table):
+    """In one line, before anything is made: places know media by numbers of 16 bits."""
+    with pytest.raises(SceneError, match=r"has 32768 media, of at most 32767") as error:
+        placed(table, *[Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))] * 32768)
+    assert "\n" not in str(error.value)
+
+
+def test_a_wide_floor_needs_no_fine_cells(table):
+    """Under a thin slab of fine grains it had 3 million, which took 3 s; many facets still have theirs."""
+    floor = SurfaceSpec(Rectangle((0.0, 0.0, -0.001), (10.0, 0.0, 0.0), (0.0, 10.0, 0.0)), (0.5, 0.5, 0.5))
+    medium = MediumSpec(Slab(0.0, 0.02), 0.5, 0.005, (GrainSpec(table),), name="m")
+    camera = Camera((0.0, -5.0, 3.0), (0.0, 0.0, 0.0), 2, 2)
+    grid = geometry.place(Scene(camera, (ConstantLight((1.0, 1.0, 1.0)),), (medium,), (floor,))).arrays.grid
+    assert len(grid.listed) < 1_000_000
+
+
+@pytest.mark.parametrize("level", ["volume", "teleport"])
+def test_ways_end_at_their_own_boundary(table, tmp_path, level):
+    """Two meshes that overlap by less than is refused: a way in one that meets the other first, more than a hair before
+    its own end, ends there; it went on for ever, in light that never came out, 23 of 2048 times."""
+    shapes = boxes(tmp_path, ((-1.0, -0.5, -0.5), (0.0003, 0.5, 0.5)), ((0.0, -0.5, -0.5), (1.0, 0.5, 0.5)))
+    media = tuple(MediumSpec(shape, 0.5, 0.1, (GrainSpec(table),), name=f"{n}") for n, shape in enumerate(shapes))
+    camera = Camera((4.0, 0.3, 0.2), (0.0, 0.0, 0.0), 16, 16, fov_deg=25.0)
+    made = world.build(Scene(camera, (ConstantLight((1.0, 1.0, 1.0)),), media, name="o"), level)
+    made.media = made.media._replace(limit=1000)
+    picture = render.render(made, spp=8, threads=1, seed=1)
+    assert picture.truncated == 0 and (picture.rgb == 1.0).all()

@@ -23,7 +23,7 @@ from tsdf.grain.meshes import read_mesh
 from tsdf.scene.keys import FARTHEST
 from tsdf.scene.scene import SMALLEST, Box, MediumSpec, Mesh, Rectangle, Scene, Slab, Sphere, SurfaceSpec, called
 from tsdf.vectors import KERNEL, dot, step
-from tsdf.walk.grid import GRAZING, NONE, ROUNDING, Grid, free_around, grid_of, march
+from tsdf.walk.grid import GRAZING, MOST_MEDIA, NONE, ROUNDING, Grid, free_around, grid_of, held, march
 from tsdf.walk.room import BALL, BOX, CLOSED, MESH, OPEN, SLAB, Room, exact_depth, room_of
 
 SLACK = 2e-6  # [of a facet's largest coordinate] a point this near to a facet is on it: 30 float32 ulps
@@ -129,15 +129,16 @@ def ball_hit(balls, p, d):
 
 
 @njit(forceinline=True, **KERNEL)
-def clearance(g, m, p):
-    """Return a length within which p of medium m is sure to have neither its boundary nor a surface around it."""
+def clearance(g, m, p, least=0.0):
+    """Return a length within which p of medium m is sure to have neither its boundary nor a surface around it; one
+    below `least` may be shorter than need be."""
     bound = math.inf
     if g.kind[m] != MESH:
         bound = exact_depth(g.kind[m], g.shape[m], p)
     for b in range(g.balls.shape[0]):
         q = (p[0] - g.balls[b, 0], p[1] - g.balls[b, 1], p[2] - g.balls[b, 2])
         bound = min(bound, abs(math.sqrt(dot(q, q)) - g.balls[b, 3]))
-    return bound if g.engines == 0 else min(bound, free_around(g.grid, p))
+    return bound if g.engines == 0 else min(bound, free_around(g.grid, p, least))
 
 
 @njit(**KERNEL)
@@ -152,9 +153,9 @@ def unmet(g, met, m, p, d, end):
         t, ball = ball_hit(g.balls, p, d)
         if t - end <= NEAR * (end + g.balls[ball, 3]):
             return False, False
-    if g.engines == 0:
+    if g.engines == 0 or (g.convex and held(g.grid, m, step(p, end, d))):
         return True, False
-    if not march(g.grid, met, p, d, end):
+    if not march(g.grid, met, m, p, d, end):
         return False, False
     for e in range(met.shape[0]):
         if met[e] != NONE:
@@ -309,8 +310,10 @@ def place(scene: Scene, grains: bool = False) -> Place:
     Raises
     ------
     SceneError
-        A boundary that is not a closed, simple surface, media that overlap, a mesh that cannot be read.
+        A boundary that is not a closed, simple surface, media that overlap, a mesh that cannot be read, too many media.
     """
+    if len(scene.media) > MOST_MEDIA:
+        raise SceneError(f"{scene.name}: has {len(scene.media)} media, of at most {MOST_MEDIA}; leave some out")
     boundaries, notes = _boundaries(scene)
     surfaces = [
         None if isinstance(s.shape, Sphere) else _surface_mesh(s, f"{scene.name}: {called('surface', i, s.name)}")

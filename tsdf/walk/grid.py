@@ -20,12 +20,15 @@ from tsdf.vectors import KERNEL, dot
 STEPS = 64  # of a ray through the grid; the ray engine is faster with those that need more
 OUTSIDE = 16  # facets that reach out of the grid, with more of which rays that leave it are left to the ray engine
 MOST_LISTED = 2e7  # facets in all cells, about: cells of very many large facets are larger
+FEW_LISTED, EACH_LISTED = 4e5, 30  # the most there, and for each facet more: a wide floor needs no fine cells
 BATCH = 1 << 17  # triangles and boxes that are looked at together
 PAD = 0.004  # [cells] facets count as in a cell when this near to it, far more than the rounding of the way through
 GRAZING = 100.0  # times its thickness is the most that a point is moved off a facet along a ray
 FEW = 3  # facets in a cell, below which nothing is gained by looking whether they all are on one side
 ROUNDING = 1e-13  # of coordinates: some hundreds of the last bits of heights; what leans outward by less is flat
+BEYOND = 1.0 + 1e-9  # walls of cells that a ray has passed, or nearly so, count
 NEAR = 1e-7  # [cells] that near to a facet, on which side of it a place is is not asked
+MOST_MEDIA = 2**15 - 1  # whose numbers a grid has room for
 NONE, UNKNOWN = -1, -2
 
 
@@ -119,8 +122,8 @@ def inverse(x):
 
 
 @njit(**KERNEL)
-def free_around(grid, p):
-    """Return a length within which no facet is around p."""
+def free_around(grid, p, least):
+    """Return a length within which no facet is around p; one below `least` may be shorter than need be."""
     nx, ny, nz = grid.free.shape
     if nx == 0:
         return math.inf if grid.beyond else 0.0
@@ -132,13 +135,15 @@ def free_around(grid, p):
         x, y, z = x - i - 0.5, y - j - 0.5, z - k - 0.5
         bound = grid.free[i, j, k] - h * math.sqrt(x * x + y * y + z * z)
         wall = h * (0.5 - max(max(abs(x), abs(y)), abs(z)))
-        if bound < wall:
+        if bound < wall and wall > least:
             # Nearer than the walls of the cell there are only its own, none nearer than its plane
             what = int(grid.cells[(i * ny + j) * nz + k])
             for at in range(grid.first[what] if what >= 0 else 0, grid.first[what + 1] if what >= 0 else 0):
                 f = grid.listed[at]
                 n = (grid.planes[f, 0], grid.planes[f, 1], grid.planes[f, 2])
                 wall = min(wall, abs(dot(n, p) - grid.planes[f, 3]))
+                if wall <= max(bound, least):
+                    return bound
             bound = max(bound, wall)
         return bound
     if not grid.beyond:
@@ -148,26 +153,27 @@ def free_around(grid, p):
 
 
 @njit(forceinline=True, **KERNEL)
-def compared(grid, met, facet, p, d, line, end):
-    """Note a facet that a ray, of that line, meets before `end` in `met` (meshes,), if it is the first of its mesh so
-    far; return the distance, or infinity."""
+def compared(grid, met, m, facet, p, d, end):
+    """Note a facet that a ray meets before `end` in `met` (meshes,), if it is the first of its mesh so far; return the
+    distance, or infinity where another medium's boundary does not end a way in medium m."""
     n = (grid.planes[facet, 0], grid.planes[facet, 1], grid.planes[facet, 2])
     cosine, height = dot(n, d), grid.planes[facet, 3] - dot(n, p)
     if not (height * cosine >= 0.0 and abs(height) <= end * abs(cosine)):
         return math.inf
     t = height / cosine  # most facets are left out without the division
-    if not (0.0 <= t < end) or not passes(grid.corners, facet, line):
+    if not (0.0 <= t < end) or not passes(grid.corners, facet, line_of(p, d)):
         return math.inf
-    before = met[grid.mesh[facet]]
+    mesh = grid.mesh[facet] if met.shape[0] > 1 else 0
+    before = met[mesh]
     if before == NONE or t < plane_hit(grid.planes, before, p, d)[0]:
-        met[grid.mesh[facet]] = facet
-    return t
+        met[mesh] = facet
+    return t if met.shape[0] == 1 or m < 0 or grid.owner[mesh] == m or grid.owner[mesh] == NONE else math.inf
 
 
 @njit(forceinline=True, **KERNEL)
-def searched(grid, met, what, p, d, line, inside, end):
-    """Note in `met` which facets of an occupied cell a ray meets, that is in it between two distances; return how far
-    it is still of interest."""
+def searched(grid, met, m, what, p, d, inside, end):
+    """Note in `met` which facets of an occupied cell a ray in medium m meets, that is in it between two distances;
+    return how far it is still of interest."""
     here, there = grid.first[what], grid.first[what + 1]
     if there - here >= FEW:  # it may be on one side of all of them
         n = (grid.slabs[what, 0], grid.slabs[what, 1], grid.slabs[what, 2])
@@ -176,56 +182,46 @@ def searched(grid, met, what, p, d, line, inside, end):
         if min(a, b) > grid.slabs[what, 4] or max(a, b) < grid.slabs[what, 3]:
             return end
     for at in range(here, there):
-        end = min(end, compared(grid, met, grid.listed[at], p, d, line, end) + grid.margin)
+        end = min(end, compared(grid, met, m, grid.listed[at], p, d, end) + grid.margin)
     return end
 
 
 @njit(**KERNEL)
-def march(grid, met, p, d, end):
+def march(grid, met, m, p, d, end):
     """Note in `met` (meshes,) the first facets that a ray meets, NONE where there is none; return whether it is known.
 
-    What is met farther than `end`, or behind what is at the place of the first facet, may be missing.
+    What is met farther than `end`, or behind what is at the place of the first facet of medium m or of a surface, may
+    be missing; of any mesh where m is none.
     """
     for e in range(met.shape[0]):
         met[e] = NONE
-    line = line_of(p, d)
     for at in range(grid.outer.shape[0]):
         facet = grid.outer[at]
-        end = min(end, compared(grid, met, facet, p, d, line, end + GRAZING * grid.thickness[facet]))
+        end = min(end, compared(grid, met, m, facet, p, d, end + GRAZING * grid.thickness[facet]))
     end += grid.margin
     nx, ny, nz = grid.free.shape
-    h = grid.edge
-    by = 1.0 / h
-    x, y, z = (p[0] - grid.low[0]) * by, (p[1] - grid.low[1]) * by, (p[2] - grid.low[2]) * by
-    dx, dy, dz = d[0] * by, d[1] * by, d[2] * by
-    if 0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz:
-        i, j, k = int(x), int(y), int(z)
-        if 0.0 <= x + end * dx - i < 1.0 and 0.0 <= y + end * dy - j < 1.0 and 0.0 <= z + end * dz - k < 1.0:
-            # Short ways mostly end in the cell in which they begin
-            what = int(grid.cells[(i * ny + j) * nz + k])
-            if what >= 0:
-                searched(grid, met, what, p, d, line, (0.0, end), end)
-            return True
-    # The ray enters the grid at t and leaves it at `last`
-    t, last = 0.0, math.inf
+    size = 1.0 / grid.edge
+    x, y, z = (p[0] - grid.low[0]) * size, (p[1] - grid.low[1]) * size, (p[2] - grid.low[2]) * size
+    dx, dy, dz = d[0] * size, d[1] * size, d[2] * size
     ix, iy, iz = inverse(dx), inverse(dy), inverse(dz)
-    a, b = -x * ix, (nx - x) * ix
-    t, last = max(t, min(a, b)), min(last, max(a, b))
-    a, b = -y * iy, (ny - y) * iy
-    t, last = max(t, min(a, b)), min(last, max(a, b))
-    a, b = -z * iz, (nz - z) * iz
-    t, last = max(t, min(a, b)), min(last, max(a, b))
+    # The ray enters the grid at t and leaves it at `last`
+    (ax, ay, az), (bx, by, bz) = (-x * ix, -y * iy, -z * iz), ((nx - x) * ix, (ny - y) * iy, (nz - z) * iz)
+    t, i, j, k = 0.0, int(x), int(y), int(z)
+    if not (0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz):
+        t = max(max(min(ax, bx), min(ay, by)), max(min(az, bz), 0.0))
+        i, j, k = int(x + t * dx), int(y + t * dy), int(z + t * dz)
+        i, j, k = min(max(i, 0), nx - 1), min(max(j, 0), ny - 1), min(max(k, 0), nz - 1)
+    last = min(max(ax, bx), min(max(ay, by), max(az, bz)))
     if not grid.closed and (nx == 0 or t > 0.0 or last < end):
         return False
-    last -= 1e-8 * h + 1e-13 * last  # not beyond it by rounding
-    i, j, k = (
-        min(max(int(x + t * dx), 0), nx - 1), min(max(int(y + t * dy), 0), ny - 1), min(max(int(z + t * dz), 0), nz - 1)
-    )  # fmt: skip
+    last -= 1e-8 * grid.edge + 1e-13 * last  # not beyond it by rounding
     cell = (i * ny + j) * nz + k
-    # Where it leaves its cell along each axis, what lies between two such places, and which cell is the next
+    # Where it leaves its cell along each axis, what lies between two such places, and which cell is the next. Choices
+    # that a processor cannot foresee are made without branches.
     tx, ty, tz = ((i + (dx >= 0.0)) - x) * ix, ((j + (dy >= 0.0)) - y) * iy, ((k + (dz >= 0.0)) - z) * iz
     nextx, nexty, nextz = (ny * nz if dx >= 0.0 else -ny * nz), (nz if dy >= 0.0 else -nz), (1 if dz >= 0.0 else -1)
-    ix, iy, iz, dx, dy, dz = abs(ix), abs(iy), abs(iz), abs(dx), abs(dy), abs(dz)
+    ix, iy, iz = abs(ix), abs(iy), abs(iz)
+    dx, dy, dz = max(abs(dx), 1e-300), max(abs(dy), 1e-300), max(abs(dz), 1e-300)
     for _ in range(STEPS):
         if not t <= min(last, end):
             return True
@@ -233,35 +229,25 @@ def march(grid, met, p, d, end):
             return False
         what = int(grid.cells[cell])
         if what >= 0:
-            end = searched(grid, met, what, p, d, line, (t, min(end, min(tx, min(ty, tz)))), end)
+            end = searched(grid, met, m, what, p, d, (t, min(end, min(tx, min(ty, tz)))), end)
         if what >= -1:
-            if tx <= ty and tx <= tz:
-                t = tx
-                tx += ix
-                cell += nextx
-            elif ty <= tz:
-                t = ty
-                ty += iy
-                cell += nexty
-            else:
-                t = tz
-                tz += iz
-                cell += nextz
+            t = min(tx, min(ty, tz))
+            cell += (nextx if tx <= t else 0) + (nexty if ty <= t else 0) + (nextz if tz <= t else 0)
+            tx += ix if tx <= t else 0.0
+            ty += iy if ty <= t else 0.0
+            tz += iz if tz <= t else 0.0
             continue
         far = -what - 1
         t = min(tx + far * ix, min(ty + far * iy, tz + far * iz))
-        if tx <= t:
-            n = 1 + int((t - tx) * dx + 1e-9)
-            tx += n * ix
-            cell += n * nextx
-        if ty <= t:
-            n = 1 + int((t - ty) * dy + 1e-9)
-            ty += n * iy
-            cell += n * nexty
-        if tz <= t:
-            n = 1 + int((t - tz) * dz + 1e-9)
-            tz += n * iz
-            cell += n * nextz
+        n = int(max((t - tx) * dx + BEYOND, 0.0))
+        tx += n * ix
+        cell += n * nextx
+        n = int(max((t - ty) * dy + BEYOND, 0.0))
+        ty += n * iy
+        cell += n * nexty
+        n = int(max((t - tz) * dz + BEYOND, 0.0))
+        tz += n * iz
+        cell += n * nextz
     return False
 
 
@@ -327,12 +313,24 @@ def home_of(grid, sums, p):
 
 
 @njit(**KERNEL)
+def held(grid, m, p):
+    """Return whether p is in a cell that no facet is in and medium m holds."""
+    nx, ny, nz = grid.free.shape
+    by = 1.0 / grid.edge
+    x, y, z = (p[0] - grid.low[0]) * by, (p[1] - grid.low[1]) * by, (p[2] - grid.low[2]) * by
+    if not (0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz):
+        return False
+    cell = (int(x) * ny + int(y)) * nz + int(z)
+    return grid.cells[cell] < 0 and grid.home[cell] == m
+
+
+@njit(**KERNEL)
 def slipped(grid, sums, m, p, near):
     """Return whether p, from where the ray engine sees the mesh of medium m from within, is surely outside it, farther
     than `near`: once in 1e7 times a ray slips through between two facets. `sums` (meshes,) is used."""
     if grid.free.shape[0] == 0:  # there is no grid that would know
         return False
-    home, off = home_of(grid, sums, p), free_around(grid, p)
+    home, off = home_of(grid, sums, p), free_around(grid, p, 0.0)
     for k in range(3):
         off = max(off, max(grid.low[k] - p[k], p[k] - grid.low[k] - grid.edge * grid.free.shape[k]))
     return home != m and home != UNKNOWN and off > near
@@ -407,7 +405,8 @@ def grid_of(meshes: Sequence[np.ndarray], owner: np.ndarray, planes: np.ndarray,
     size = np.maximum(high - low, 1e-3 * (high - low).max())
     sides = np.sort(np.clip(corners.max(axis=1), low, high) - np.clip(corners.min(axis=1), low, high), axis=1)
     area = float((sides[:, 1] * sides[:, 2]).sum())  # of the facets in the box, at most twice as much
-    edge = max(float((size.prod() / cells) ** (1 / 3)), math.sqrt(area / MOST_LISTED), least)
+    most = min(FEW_LISTED + EACH_LISTED * len(corners), MOST_LISTED)
+    edge = max(float((size.prod() / cells) ** (1 / 3)), math.sqrt(area / most), least)
     counts = np.ceil(size / edge).astype(int) + 2
     low = 0.5 * (low + high) - 0.5 * counts * edge
     free, first, listed = cells_of(corners, planes, low, edge, counts)

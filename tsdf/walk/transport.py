@@ -34,7 +34,7 @@ from tsdf.vectors import KERNEL, cross, dot, frame, minus, renewed, step, triple
 from tsdf.walk import explicit as X
 from tsdf.walk import memory as M
 from tsdf.walk.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit, unmet
-from tsdf.walk.grid import GRAZING, home_of, march, plane_hit, slipped
+from tsdf.walk.grid import GRAZING, held, home_of, march, plane_hit, slipped
 from tsdf.walk.hybrid import hand_over
 from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, Leaps, leap, missing, patience
 from tsdf.walk.lights import LightArrays
@@ -217,7 +217,11 @@ def connect(world, batch, w, amounts, p, c, share, bound):
         else:
             aim(shadow, offset, size, toward, amount, c)
             g, end = world.geometry, step(p, size, triple(shadow.e))
-            if bound > 0.0 and alone(g, w.medium) and clearance(g, w.medium, end) > HAIR * g.slack[w.medium]:
+            if g.convex:
+                sure = held(g.grid, w.medium, end)
+            else:
+                sure = bound > 0.0 and alone(g, w.medium) and clearance(g, w.medium, end) > HAIR * g.slack[w.medium]
+            if sure:
                 shadow.mode = FLY
                 write(shadow.p, end)
 
@@ -303,7 +307,7 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
             free = -mean * math.log(1.0 - unit(mix(key)))
         if not once and bound <= free:
             if not fresh and (bound <= 0.0 or not convex):
-                bound = clearance(g, m, p)
+                bound = clearance(g, m, p, free)
             if bound <= free:
                 if convex:
                     there = clearance(g, m, step(p, free, d)) - hair
@@ -349,7 +353,7 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
                 c += 1
         if sampled:
             if bound < 8.0 * mean:
-                bound = max(bound, clearance(g, m, p))
+                bound = max(bound, clearance(g, m, p, reach))
             share = math.exp((reach - bound) / mean) if reach < bound else 1.0
             key += GOLDEN
             if unit(mix(key)) < share:
@@ -370,7 +374,7 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
         if reach > 0.0:
             size = scale * math.sqrt(dot(offset, offset))
             if bound <= size and (bound <= 0.0 or not convex):
-                bound = clearance(g, m, p)
+                bound = clearance(g, m, p, size)
             there = bound - size
             if there > 0.0 or size == 0.0:
                 p, bound = step(p, scale, offset), there
@@ -472,7 +476,7 @@ def look(world, batch, w):
     elif w.free >= 0.0:
         end = w.free
     spot = batch.hits.shape[0] - 1
-    if not march(g.grid, batch.hits[spot], triple(w.p), way, max(end, 0.0)):
+    if not march(g.grid, batch.hits[spot], w.medium, triple(w.p), way, max(end, 0.0)):
         return False
     w.ray = spot
     return True
