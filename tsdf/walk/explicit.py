@@ -85,21 +85,6 @@ def named(grains, m, i, j, k, sphere):
 
 
 @njit(**KERNEL)
-def next_grain(grains, room, m, p, d, t_max):
-    """Return distance to the next grain's bounding sphere along d from p [unit] or infinity, its centre and its key."""
-    r = grains.radius[m]
-    o = (p[0] / r, p[1] / r, p[2] / r)
-    t = 0.0
-    while True:
-        t, i, j, k, sphere = next_sphere(grains.cells[m], o, d, t, t_max / r)
-        if sphere < 0:
-            return math.inf, o, np.uint64(0)
-        centre = centre_of(grains, m, i, j, k, sphere)
-        if stands(room, m, centre):
-            return t * r, centre, named(grains, m, i, j, k, sphere)
-
-
-@njit(**KERNEL)
 def find(grains, room, w, t_max):
     """Find the next grain that a walker meets, nearer than t_max [unit], and write down where it is, or that it is not
     known where. Most often it is one of those around the sphere that the walker has just left."""
