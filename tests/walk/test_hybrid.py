@@ -37,6 +37,7 @@ from tsdf.scene.scene import (
     SunLight,
     SurfaceSpec,
 )
+from tsdf.spheres.around import around_of
 from tsdf.spheres.packing import Packing, cells_of
 from tsdf.walk import explicit, geometry, hybrid, memory, transport
 from tsdf.walk.walker import FLY, HANDED, MOST, UNKNOWN, WALKER
@@ -178,7 +179,7 @@ def one_mirror(ball: Table, radius: float) -> World:
     made = world.build(Scene(ABOVE, (WHITE,), (medium,), render=Render(explicit_grains=1)), "teleport-memory")
     alone = Packing(np.zeros((1, 3)), 20.0, 4.0 / 3.0 * math.pi / 8000.0, 0)
     made.packed.arrays = made.packed.arrays._replace(
-        cells=(cells_of(alone),), centres=(np.zeros((1, 3)),), eta=np.array([1e12])
+        cells=(cells_of(alone),), centres=(np.zeros((1, 3)),), around=(around_of(alone),), eta=np.array([1e12])
     )
     return made
 
@@ -241,8 +242,9 @@ def test_the_next_sphere_is_that_of_the_packing(ball: Table) -> None:
             b = float(w["b"])
             return np.array(w["p"]) + (w["free"] + math.sqrt(1.0 - b * b)) * d - b * np.array(w["t"])
 
-        _, centre, _ = explicit.next_grain(arrays, room, 0, tuple(p), tuple(d), 1e9)
-        found["packing"].append(seen(np.array(centre)))
+        other = w.copy()
+        explicit.find(arrays, room, other, 1e9)
+        found["packing"].append(seen(np.array(other["e"])))
         for name in ("chain", "turned over", "from the middle"):
             other = w.copy()
             if name == "turned over":

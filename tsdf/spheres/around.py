@@ -19,7 +19,7 @@ BLOCKS = 3  # of so many around each; more are seldom needed and fill the cache
 FILLED = 11.0  # spheres that reach into a cell of the grid, in the mean: few cells need a second block
 _PAD = 1e-3  # what float32 says is known to be nearer than
 _FAR = np.float32(1e6)
-_ENDLESS = 1e4  # lines along an axis may never meet a sphere
+ENDLESS = 1e4  # [R] lines along an axis may never meet a sphere
 _LAST, _NONE = np.int32(LANES - 1), np.int32(2**31 - 1)
 
 
@@ -82,7 +82,7 @@ def _wide(packing: Packing) -> tuple[int, np.ndarray, np.ndarray]:
     density = packing.fraction * 3.0 / (4.0 * math.pi)
     widths = np.linspace(0.5, 20.0, 400)  # the volume within 1 of a cube, by Steiner's formula
     volume = widths**3 + 6.0 * widths**2 + 3.0 * math.pi * widths + 4.0 * math.pi / 3.0
-    grid = cells_of(packing, float(widths[np.searchsorted(volume * density, FILLED)]))
+    grid = cells_of(packing, float(widths[min(int(np.searchsorted(volume * density, FILLED)), len(widths) - 1)]))
     m, edge, count = grid.m, packing.side / grid.m, np.diff(grid.first)
     blocks = -(-count // LANES)
     first = np.concatenate(([0], np.cumsum(blocks)))
@@ -133,14 +133,14 @@ def nearest(around, sphere, n, d):
 
 
 @njit(**KERNEL)
-def ahead(around, sphere, n, d, most):
-    """Return the sphere that light meets first beyond `reach`, and not farther than `most`, as `nearest` goes on: its
-    number and tile relative to that of the sphere that is left, -1 and zeros if there is none."""
-    side, m, start = around.side, around.m, around.reach
-    edge, per_edge, c = side / m, m / side, around.centres
+def across(around, p, d, start, most):
+    """Return the sphere that light meets first along d from p, anywhere, in wide cells; its number and tile, -1 and
+    zeros if there is none between the distances `start` and `most` or `ENDLESS`; to about 1e-6 R, as float32 is."""
+    side, m = around.side, around.m
+    edge, per_edge = side / m, m / side
+    px, py, pz = p
     dx, dy, dz = d
-    px, py, pz = c[sphere, 0] + n[0], c[sphere, 1] + n[1], c[sphere, 2] + n[2]
-    end = min(most, _ENDLESS)
+    end = min(most, ENDLESS)
     gx, gy, gz = (
         math.floor((px + start * dx) * per_edge),
         math.floor((py + start * dy) * per_edge),
@@ -175,6 +175,15 @@ def ahead(around, sphere, n, d, most):
         else:
             tz, gz = tz + ez, gz + (1 if dz > 0.0 else -1)
     return -1, 0, 0, 0
+
+
+@njit(**KERNEL)
+def ahead(around, sphere, n, d, most):
+    """Return the sphere that light meets first beyond `reach`, and not farther than `most`, as `nearest` goes on: its
+    number and tile relative to that of the sphere that is left, -1 and zeros if there is none."""
+    c = around.centres
+    p = (c[sphere, 0] + n[0], c[sphere, 1] + n[1], c[sphere, 2] + n[2])
+    return across(around, p, d, around.reach, most)
 
 
 @njit(forceinline=True, **KERNEL)

@@ -338,9 +338,8 @@ def _lower(world: World, fraction: float, packing: int, height: float) -> None:
     """Move the spheres of a packed world down, all the same."""
     made = pack(fraction, SPHERES, packing)
     moved = replace(made, centres=(made.centres - (0.0, 0.0, height)) % made.side)
-    around = around_of(moved if world.media.traits.answered else None)
     world.packed.arrays = world.packed.arrays._replace(
-        cells=(cells_of(moved),), centres=(np.ascontiguousarray(moved.centres),), around=(around,)
+        cells=(cells_of(moved),), centres=(np.ascontiguousarray(moved.centres),), around=(around_of(moved),)
     )
 
 

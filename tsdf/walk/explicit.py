@@ -15,14 +15,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tsdf.compiled import njit
+from tsdf.data.sampler import turned as on_circle
 from tsdf.data.table import Table
 from tsdf.errors import SceneError, TSDFError
 from tsdf.grain.grains import BUILT_INS, Grain, embree_scene, grain_from_mesh, load_grain
 from tsdf.grain.meshes import read_mesh
 from tsdf.grain.optics import OFFSET, UNPOLARISED, P, S, fresnel, nearer, on_plane, parted, sound
-from tsdf.sampling import GOLDEN, key_of, mix, turn, unit
+from tsdf.sampling import GOLDEN, key_of, mix, unit
 from tsdf.scene.scene import GrainSpec, Scene, called
-from tsdf.spheres.around import Around, around_of
+from tsdf.spheres.around import ENDLESS, Around, across, around_of, entered, next_around
 from tsdf.spheres.packing import Cells, cells_of, next_sphere, pack
 from tsdf.vectors import KERNEL, dot, renewed, step, triple
 from tsdf.walk.geometry import NONE, planes_of
@@ -32,14 +33,15 @@ from tsdf.walk.walker import write
 EXACT_SPHERE = -1
 ENTERED, INSIDE, RETRIED, LEFT = 0, 1, 2, 4
 MOST_SIDES = 64  # of a convex grain that needs no ray engine, which with more is faster
+HARDLY = 1e-6  # [R] beyond a sphere where no grain stands, the next is looked for
 FLAT = 1e-9  # [R] planes that near to each other are one side, and no vertex of a convex grain is higher over one
 
 
 class Grains(NamedTuple):
     """What kernels ask about packed grains. The first three are tuples over media, the rest arrays.
 
-    cells, centres, around: the tile's grid, its (n, 3) centres [R], and for grains that are not traced the spheres
-    around each; radius (m,): R [unit]; seed (m,) uint64. Of components:
+    cells, centres, around: the tile's grid, its (n, 3) centres [R], and the spheres around each; radius (m,): R [unit];
+    seed (m,) uint64. Of components:
     share (c,): running sum of number fractions in each medium; eta, kept_apart (c,) (the polarisations), exemplar (c,)
     int32: ray-engine scene. Of the exemplars' facets: planes (f, 4), centroids (f, 3), first_facet (e,). first_side
     (e + 1,), sides (s,): of exemplars that are convex and have few sides, a facet of each side.
@@ -83,30 +85,75 @@ def named(grains, m, i, j, k, sphere):
 
 
 @njit(**KERNEL)
-def next_grain(grains, room, m, p, d, t_max):
-    """Return distance to the next grain's bounding sphere along d from p [unit] or infinity, its centre and its key."""
-    r = grains.radius[m]
-    o = (p[0] / r, p[1] / r, p[2] / r)
-    t = 0.0
-    while True:
-        t, i, j, k, sphere = next_sphere(grains.cells[m], o, d, t, t_max / r)
-        if sphere < 0:
-            return math.inf, o, np.uint64(0)
+def find(grains, room, w, t_max):
+    """Find the next grain that a walker meets, nearer than t_max [unit], and write down where it is, or that it is not
+    known where. Most often it is one of those around the sphere that the walker has just left."""
+    m, p, d, number = w.medium, triple(w.p), triple(w.d), w.left - 1
+    r, around, cells = grains.radius[m], grains.around[m], grains.cells[m]
+    o, most, w.free = (p[0] / r, p[1] / r, p[2] / r), t_max / r, -1.0
+    if number >= 0 and cells.reach <= ENDLESS:
+        q, c = (w.q[0] / r, w.q[1] / r, w.q[2] / r), grains.centres[m]
+        home = tile(step(q, -1.0, (c[number, 0], c[number, 1], c[number, 2])), 1.0 / cells.side, 0.5)
+        sphere, i, j, k, _, _ = next_around(around, number, step(o, -1.0, q), d, most)
+        i, j, k = i + int(home[0]), j + int(home[1]), k + int(home[2])
+    else:
+        sphere, i, j, k = beyond(cells, around, o, d, 0.0, most)
+    while sphere >= 0:
         centre = centre_of(grains, m, i, j, k, sphere)
+        away = step(centre, -1.0, p)
+        s = max(entered((away[0] / r, away[1] / r, away[2] / r), d)[0], 0.0)
         if stands(room, m, centre):
-            return t * r, centre, named(grains, m, i, j, k, sphere)
+            w.free, w.grain, w.facet = r * s, named(grains, m, i, j, k, sphere), sphere + 1
+            write(w.e, centre)
+            return
+        before = (sphere, i, j, k)
+        sphere, i, j, k = beyond(cells, around, o, d, s + HARDLY, most)
+        if (sphere, i, j, k) == before:  # hardly touched, it seems to be farther
+            _, i, j, k, sphere = next_sphere(cells, o, d, s + HARDLY, most)
+
+
+@njit(**KERNEL)
+def beyond(cells, around, o, d, start, most):
+    """Return the sphere that a ray from o enters first between two distances, its number, -1 for none, and tile."""
+    if cells.reach > ENDLESS:  # so few spheres that the wide cells' float32 is not enough
+        _, i, j, k, sphere = next_sphere(cells, o, d, start, most)
+        return sphere, i, j, k
+    home = tile(o, 1.0 / cells.side, 0.0)
+    sphere, i, j, k = across(around, step(o, -cells.side, home), d, start, most)
+    return sphere, i + int(home[0]), j + int(home[1]), k + int(home[2])
+
+
+@njit(forceinline=True, **KERNEL)
+def tile(x, per_side, half):
+    """Return the numbers of a tile along the axes, as floats."""
+    return (
+        math.floor(x[0] * per_side + half) * 1.0,
+        math.floor(x[1] * per_side + half) * 1.0,
+        math.floor(x[2] * per_side + half) * 1.0,
+    )
+
+
+@njit(forceinline=True, **KERNEL)
+def rotation(key):
+    """Return the uniformly random rotation (Shoemake 1992) of a grain's key, a quaternion (x, y, z, w)."""
+    u = unit(mix(key + np.uint64(1)))
+    c1, s1 = on_circle(unit(mix(key + np.uint64(2))))
+    c2, s2 = on_circle(unit(mix(key + np.uint64(3))))
+    a, b = math.sqrt(1.0 - u), math.sqrt(u)
+    return a * s1, a * c1, b * s2, b * c2
 
 
 @njit(**KERNEL)
 def turned(key, v, back):
-    """Return a triple turned by the uniformly random rotation (Shoemake 1992) of a grain's key, or turned back."""
-    u = unit(mix(key + np.uint64(1)))
-    c1, s1 = turn(unit(mix(key + np.uint64(2))))
-    c2, s2 = turn(unit(mix(key + np.uint64(3))))
-    a, b = math.sqrt(1.0 - u), math.sqrt(u)
-    x, y, z, w = a * s1, a * c1, b * s2, b * c2
-    if back:
-        x, y, z = -x, -y, -z
+    """Return a triple turned by the rotation of a grain's key, or turned back."""
+    x, y, z, w = rotation(key)
+    return rotated((-x, -y, -z) if back else (x, y, z), w, v)
+
+
+@njit(forceinline=True, **KERNEL)
+def rotated(axis, w, v):
+    """Return a triple turned by the quaternion of vector `axis` and scalar w."""
+    x, y, z = axis
     tx = 2.0 * (y * v[2] - z * v[1])
     ty = 2.0 * (z * v[0] - x * v[2])
     tz = 2.0 * (x * v[1] - y * v[0])
@@ -366,7 +413,7 @@ def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed
             raise SceneError(f"{where}: {error}") from None
         cells.append(cells_of(packing))
         centres.append(np.ascontiguousarray(packing.centres))
-        around.append(around_of(None if traced else packing))
+        around.append(around_of(packing))
         notes.append(f"{where}: {len(packing.centres)} spheres in a tile of {packing.side:.4g} R, "
                      f"packing fraction {packing.fraction:.6f}")  # fmt: skip
         fractions = np.array([grain.fraction for grain in medium.grains])

@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tsdf.compiled import njit
+from tsdf.data.sampler import turned
 from tsdf.errors import UsageError
-from tsdf.sampling import turn
 from tsdf.vectors import KERNEL, frame, step
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # [1] of linear sRGB, IEC 61966-2-1
@@ -282,7 +282,7 @@ def draw(lights, u0, u1, u2):
         column, along = _cell(sums, guide[int(u2 * guide.size)], u2 * sums[-1])
         z = lights.cos_edges[row] + down * (lights.cos_edges[row + 1] - lights.cos_edges[row])
         azimuth = lights.rotation - (column + along) / lights.columns.shape[1]
-        c, s = turn(azimuth - math.floor(azimuth))
+        c, s = turned(azimuth - math.floor(azimuth))
         rho = math.sqrt(max(0.0, 1.0 - z * z))
         direction = (rho * c, rho * s, z)
     else:
@@ -291,7 +291,7 @@ def draw(lights, u0, u1, u2):
         centre = (lights.sun_direction[sun, 0], lights.sun_direction[sun, 1], lights.sun_direction[sun, 2])
         s, t = frame(centre)
         rho = math.sqrt(drop * (2.0 - drop))
-        c, d = turn(u2)
+        c, d = turned(u2)
         direction = step(step(step(centre, -drop, centre), rho * c, s), rho * d, t)
     r, g, b, density = _sent(lights, direction, row, column)
     if density <= 0.0:  # rounding can carry the edge of a sun to where nothing is drawn

@@ -19,7 +19,8 @@ from tsdf.data.table import Table
 from tsdf.sampling import GOLDEN, mix, unit
 from tsdf.spheres.gaps import Law
 from tsdf.vectors import KERNEL, cross, dot, frame, step, triple
-from tsdf.walk.geometry import NONE, clearance, unmet
+from tsdf.walk.geometry import NEAR, NONE, ball_hit, clearance, exact_hit
+from tsdf.walk.grid import GRAZING, march, plane_hit
 from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, leap, missing, patience
 from tsdf.walk.lights import draw as draw_light
 from tsdf.walk.room import MESH, stands
@@ -41,7 +42,9 @@ from tsdf.walk.walker import (
     write,
 )
 
-TWICE = np.uint64((2 * int(GOLDEN)) & 0xFFFFFFFFFFFFFFFF)  # two numbers on
+STRAIGHT = -2  # in place of a component: light that it did not deflect
+FAR = 2.0  # [mean free paths] how much farther than a flight it is looked where walls are near, for those to come
+FAULT = -1  # what becomes of a shadow that meets neither grain nor wall
 AIMED = 16  # records of each column of cos theta that light aimed at a lamp is drawn from
 
 
@@ -117,6 +120,15 @@ def sent(grain, d, t):
     return new, t, b, step(step((0.0, 0.0, 0.0), b, t), math.sqrt(max(0.0, 1.0 - b * b)), new)
 
 
+@njit(forceinline=True, **KERNEL)
+def component(choice, first, last, u):
+    """Return the component that u stands for."""
+    c = first
+    while c < last and u >= choice[c]:
+        c += 1
+    return c
+
+
 @njit(**KERNEL)
 def begin(w, memory):
     """Draw the sphere that a walker enters next, of which nothing is known: it starts anywhere in the packing."""
@@ -149,17 +161,148 @@ def begin(w, memory):
     w.b = b
 
 
+@njit(forceinline=True, **KERNEL)
+def parting(n, d):
+    """Return side and impact parameter with which light along d leaves a sphere where the outward normal is n."""
+    away = step(n, -dot(n, d), d)
+    b = math.sqrt(dot(away, away))
+    t = (away[0] / b, away[1] / b, away[2] / b) if b > 1e-9 else frame(d)[0]
+    return t, min(b, 1.0)
+
+
 @njit(**KERNEL)
 def emerge(w, memory, n):
     """Draw the sphere that a walker enters next, which has just left one where the outward normal is n."""
     m, d = w.medium, triple(w.d)
-    away = step(n, -dot(n, d), d)
-    b = math.sqrt(dot(away, away))
-    t = (away[0] / b, away[1] / b, away[2] / b) if b > 1e-9 else frame(d)[0]
+    t, b = parting(n, d)
     w.key += GOLDEN
-    gap, t, w.b = onward(memory, m, d, t, min(b, 1.0), mix(w.key))
+    gap, t, w.b = onward(memory, m, d, t, b, mix(w.key))
     write(w.t, t)
     w.free = memory.radius[m] * gap
+
+
+@njit(**KERNEL)
+def way_ahead(g, met, m, p, d, free, far):
+    """Return how far along d from p of medium m there is surely neither its boundary nor a surface, `far` at most, and
+    whether `met` (meshes,) says which facets are met first. It is below `free` only where that is so."""
+    if g.kind[m] != MESH:
+        t, inside, _ = exact_hit(g.kind[m], g.shape[m], p, d)
+        far = min(far, t - GRAZING * g.slack[m]) if inside else 0.0
+    if g.balls.shape[0] > 0:
+        t, ball = ball_hit(g.balls, p, d)
+        far = min(far, (t - NEAR * g.balls[ball, 3]) / (1.0 + NEAR))
+    if far <= free or g.engines == 0:
+        return far, False
+    if not march(g.grid, met, p, d, far):
+        far = free
+        if not march(g.grid, met, p, d, far):
+            return 0.0, False
+        far = math.nextafter(far, math.inf)
+    for e in range(met.shape[0]):
+        if met[e] != NONE:
+            far = min(far, plane_hit(g.grid.planes, met[e], p, d)[0] - g.grid.margin)
+    return far, True
+
+
+@njit(**KERNEL)
+def holds(world, m, centre, sure):
+    """Return whether a sphere of medium m at `centre` holds a grain, and a length within which nothing is around it;
+    `sure` says that what is clear of everything is."""
+    bound = clearance(world.geometry, m, centre) if sure else 0.0
+    return bound >= world.memory.radius[m] or stands(world.room, m, centre), bound
+
+
+@njit(forceinline=True, **KERNEL)
+def darkened(world, m, p, d, side, key, bound):
+    """Return whether a shadow meets a grain in the sphere that it enters at p, with `side` = (t, b), and the key that
+    is used up; nothing is nearer to p than `bound`."""
+    media, memory, (t, b) = world.media, world.memory, side
+    first, last = media.first[m], media.first[m] + media.kinds[m] - 1
+    c = first
+    if last > first:
+        key += GOLDEN
+        c = component(memory.choice, first, last, unit(mix(key)))
+    key += GOLDEN
+    if unit(mix(key)) >= memory.hit[c, min(int(b * b * memory.columns[c]), memory.columns[c] - 1)]:
+        return False, key
+    radius, sure = memory.radius[m], world.room.whole[m] or world.room.kind[m] != MESH
+    if sure and bound > 2.0 * radius:
+        return True, key
+    centre = step(step(p, radius * math.sqrt(max(0.0, 1.0 - b * b)), d), -radius * b, t)
+    return holds(world, m, centre, sure)[0], key
+
+
+@njit(**KERNEL)
+def shaded(world, met, m, way, side, free, key, bound):
+    """Take a shadow from sphere to sphere, straight on, while its way can meet nothing else.
+
+    Parameters
+    ----------
+    met : (meshes,) int32
+        For what `way_ahead` says.
+    way, side : tuples
+        Where it is and whither, (p, d), and the side and impact parameter with which it enters the next sphere, (t, b).
+    free, bound : float
+        How far that is, and a length within which nothing else is.
+
+    Returns
+    -------
+    state : int
+        LOOK, ENDED where it has met a grain, FAULT where it has gone on for ever.
+    p, t, b, free, key
+        Where it has got.
+    known : bool
+        Whether `met` says what it meets then.
+    """
+    (p, d), (t, b), radius, ahead = way, side, world.memory.radius[m], 0.0
+    for _ in range(PATIENCE):
+        if max(bound, ahead) <= free:
+            ahead, known = way_ahead(world.geometry, met, m, p, d, free, free + FAR * world.media.free[m])
+            if ahead <= free:
+                return LOOK, p, t, b, free, key, known
+        p = step(p, free, d)
+        bound -= free
+        ahead -= free
+        dark, key = darkened(world, m, p, d, (t, b), key, bound)
+        if dark:
+            return ENDED, p, t, b, free, key, False
+        key += GOLDEN
+        through = 2.0 * math.sqrt(max(0.0, 1.0 - b * b))
+        gap, t, b = onward(world.memory, m, d, t, b, mix(key))
+        free = radius * (through + gap)
+    return FAULT, p, t, b, free, key, False
+
+
+@njit(**KERNEL)
+def shade(world, batch, w, once):
+    """Take a shadow in a known medium as `roam` does other walkers; it ends at the first grain that it meets."""
+    m, memory, spot = w.medium, world.memory, batch.hits.shape[0] - 1
+    if w.free < 0.0:
+        begin(w, memory)
+    p, d, t, b = triple(w.p), triple(w.d), triple(w.t), w.b
+    if once:
+        p = step(p, w.free, d)
+        dark, key = darkened(world, m, p, d, (t, b), w.key, 0.0)
+        if dark:
+            return ENDED
+        key += GOLDEN
+        through = 2.0 * math.sqrt(max(0.0, 1.0 - b * b))
+        gap, t, b = onward(memory, m, d, t, b, mix(key))
+        free = memory.radius[m] * (through + gap)
+    else:
+        bound = clearance(world.geometry, m, p)
+        state, p, t, b, free, key, known = shaded(world, batch.hits[spot], m, (p, d), (t, b), w.free, w.key, bound)
+        if state == ENDED:
+            return ENDED
+        if state == FAULT:  # no grain stands where it has got: out of bounds
+            batch.counters[FAULTS] += 1
+            w.weight = 0.0
+            return ENDED
+        w.ray = spot if known else NONE
+    write(w.p, p)
+    write(w.t, t)
+    w.b, w.key, w.free = b, key, free
+    return LOOK
 
 
 @njit(forceinline=True, **KERNEL)
@@ -170,7 +313,7 @@ def connect(world, batch, w, amounts, p, c, share, bound):
     whichever sphere it is, for the side on which it is entered is drawn anew. `share` is the probability that this is
     done at all; nothing is nearer than `bound`.
     """
-    media, memory, tables, room = world.media, world.memory, world.tables, world.room
+    media, memory, tables = world.media, world.memory, world.tables
     m, d = w.medium, triple(w.d)
     key = mix(w.key ^ OTHER)
     u0, u1 = halves(key)
@@ -184,7 +327,12 @@ def connect(world, batch, w, amounts, p, c, share, bound):
     phase = memory.met[c] * density(tables, column)
     if not phase > 0.0:
         return
-    grain = memory.aimed[column, int(u3 * AIMED)]
+    # Where grains send less this way than to all sides alike, it is seldom looked whether it arrives, and counts more
+    brings = min(1.0, 4.0 * math.pi * phase * light_pdf / (light_pdf + phase))
+    u3 *= AIMED
+    if u3 - math.floor(u3) >= brings:
+        return
+    grain = memory.aimed[column, int(u3)]
     b = float(grain[8])
     # The side of the entry is the one from which the record's light goes toward the lamp
     side = step(toward, -cosine, d)
@@ -200,50 +348,75 @@ def connect(world, batch, w, amounts, p, c, share, bound):
     radius = memory.radius[m]
     along = math.sqrt(max(0.0, 1.0 - b * b))
     centre = step(step(p, radius * along, d), -radius * b, t)
-    sure = room.whole[m] or room.kind[m] != MESH
-    # What is clear of everything is on the side on which p is
-    clear = sure and (bound > 2.0 * radius or clearance(world.geometry, m, centre) >= radius)
-    if not clear and not stands(room, m, centre):
-        return
+    sure = world.room.whole[m] or world.room.kind[m] != MESH  # what is clear of everything is on the side on which p is
+    left = bound - 2.0 * radius
+    if not sure or left <= 0.0:
+        there, around = holds(world, m, centre, sure)
+        if not there:
+            return
+        left = around - radius
     up = cross(d, t)
     b_out = float(grain[6])
     along = math.sqrt(max(0.0, 1.0 - b_out * b_out))
     nx, ny = b_out * grain[3] + along * grain[0], b_out * grain[4] + along * grain[1]
     nz = b_out * grain[5] + along * grain[2]
     n = step(step(step((0.0, 0.0, 0.0), nx, t), ny, up), nz, d)
+    # From there to where it must look it is a shadow that need not be written down
+    spot, out = batch.hits.shape[0] - 1, step(centre, radius, n)
+    key += GOLDEN
+    gap, t, b = onward(memory, m, toward, *parting(n, toward), mix(key))
+    state, at, t, b, free, key, _ = shaded(
+        world, batch.hits[spot], m, (out, toward), (t, b), radius * gap, key, max(left, 0.0)
+    )
+    if state != LOOK:
+        batch.counters[FAULTS] += state == FAULT
+        return
     number = born(batch, amounts)
     shadow, its_amounts = batch.out[number], batch.out_amounts[number]
     if media.slot[c] >= 0:
         its_amounts[media.slot[c]] += media.scale[c] * float(grain[7])
-    cast(w, shadow, step(centre, radius, n), toward, light, phase / (light_pdf + phase) / share, m, key)
-    emerge(shadow, memory, n)
+    cast(w, shadow, at, toward, light, phase / ((light_pdf + phase) * share * brings), m, key)
+    write(shadow.t, t)
+    shadow.b, shadow.free = b, free
+
+
+@njit(forceinline=True, **KERNEL)
+def drawn(world, pdf, c, cosine):
+    """Return the density per steradian with which a direction was drawn: that of a deflection by a grain of component
+    c, by an angle of that cosine, or what it was where c is NONE; -1 for none."""
+    if c == NONE:
+        return pdf
+    pdf = 0.0
+    if c != STRAIGHT:
+        pdf = world.memory.met[c] * density(world.tables, column_of(world.tables, c, cosine))
+    return pdf if pdf > 0.0 else -1.0
 
 
 @njit(**KERNEL)
 def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of a walker, in one loop
     """Take a walker in a known medium from sphere to sphere while its flights can meet nothing else; as
     `transport.wander`, but that a shadow ends at the first grain it meets. Returns LOOK, WAIT or ENDED."""
-    g, room, media, memory, tables = world.geometry, world.room, world.media, world.memory, world.tables
+    if w.shadow:
+        return shade(world, batch, w, once)
+    g, room, media, memory = world.geometry, world.room, world.media, world.memory
     m = w.medium
-    p, d, t, b, key, free = triple(w.p), triple(w.d), triple(w.t), w.b, w.key, w.free
-    radius, sampled = memory.radius[m], world.lights.sampled and not w.shadow
+    radius, sampled = memory.radius[m], world.lights.sampled
     first, last = media.first[m], media.first[m] + media.kinds[m] - 1
     mean, sure = media.free[m], room.whole[m] or room.kind[m] != MESH
-    luck, pdf, steps, met, before, state = w.luck, w.pdf, 0, 0, w.events, LOOK
-    bound, fresh, spot = 0.0 if once else clearance(g, m, p), True, batch.hits.shape[0] - 1
-    if free < 0.0:
+    bound, ahead, fresh, spot = 0.0 if once else clearance(g, m, triple(w.p)), 0.0, True, batch.hits.shape[0] - 1
+    if w.free < 0.0:
         begin(w, memory)
-        t, b, key, free = triple(w.t), w.b, w.key, w.free
-    again = NEVER
-    if not once and not w.shadow:
-        again = patience(world.leaps, m, missing(world.leaps, m, bound))
+    p, d, t, b, key, free = triple(w.p), triple(w.d), triple(w.t), w.b, w.key, w.free
+    luck, steps, met, before, state = w.luck, 0, 0, w.events, LOOK
+    bent, cosine = NONE, 0.0  # the last grain that was met here, and by how much it deflected
+    again = NEVER if once else patience(world.leaps, m, missing(world.leaps, m, bound))
     while True:
-        if not once and bound <= free:
+        if not once and max(bound, ahead) <= free:
             if not fresh:
                 bound = clearance(g, m, p)
             if bound <= free:
-                clear, known = unmet(g, batch.hits[spot], m, p, d, free)
-                if not clear:
+                ahead, known = way_ahead(g, batch.hits[spot], m, p, d, free, free + FAR * mean)
+                if ahead <= free:
                     w.ray = spot if known else NONE
                     break
         if steps >= PATIENCE or (sampled and not once and full(batch)):
@@ -256,16 +429,18 @@ def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of
         steps += 1
         p = step(p, free, d)
         bound -= free
+        ahead -= free
         if steps >= again:
             write(w.p, p)
             write(w.d, d)
             write(w.t, t)
-            w.b, w.key, w.luck, w.pdf = b, key, luck, pdf
+            w.b, w.key, w.luck, w.pdf = b, key, luck, drawn(world, w.pdf, bent, cosine)
+            bent = NONE
             wait, bound_there = leap(world, batch, w, amounts)
             again = steps + wait
             if wait <= LEAPT_ON:
                 p, d, t, b, free = triple(w.p), triple(w.d), triple(w.t), w.b, w.free
-                key, luck, pdf, bound = w.key, w.luck, w.pdf, bound_there
+                key, luck, bound, ahead = w.key, w.luck, bound_there, 0.0
                 if wait == ENDS:
                     state = ENDED
                     break
@@ -277,9 +452,15 @@ def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of
         c = first
         if last > first:
             key += GOLDEN
-            u = unit(mix(key))
-            while c < last and u >= memory.choice[c]:
-                c += 1
+            c = component(memory.choice, first, last, unit(mix(key)))
+        column = min(int(b * b * memory.columns[c]), memory.columns[c] - 1)
+        key += GOLDEN
+        there = unit(mix(key)) < memory.hit[c, column]
+        key += GOLDEN
+        bits = mix(key)
+        number = int(unit(bits) * memory.kept[c])
+        if there:  # the record comes while the lights and the room are looked at
+            fetch(memory.grains[c, column, number])
         if sampled:
             if bound < 8.0 * mean:
                 bound = max(bound, clearance(g, m, p))
@@ -291,40 +472,22 @@ def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of
                 w.key = key
                 connect(world, batch, w, amounts, p, c, share, bound)
 
-        # Is there a grain in this sphere, and is it met?
+        # Is there a grain in this sphere?
         along = math.sqrt(max(0.0, 1.0 - b * b))
-        centre = step(step(p, radius * along, d), -radius * b, t)
-        column = min(int(b * b * memory.columns[c]), memory.columns[c] - 1)
-        there, hit = True, memory.hit[c, column]
-        if bound <= 2.0 * radius or not sure:
-            if not w.shadow:  # its record, should it be met, comes while the room is looked at
-                fetch(memory.grains[c, column, int(unit(mix(key + (TWICE if hit < 1.0 else GOLDEN))) * memory.kept[c])])
-            if sure:
-                bound = max(bound, clearance(g, m, p))
-            if bound <= 2.0 * radius or not sure:
-                there = (sure and clearance(g, m, centre) >= radius) or stands(room, m, centre)
-        if there and hit < 1.0:
-            key += GOLDEN
-            there = unit(mix(key)) < hit
-        key += GOLDEN
-        bits = mix(key)
         through = 0.0
-        if not there:
-            through = 2.0 * along
-        elif w.shadow:
-            state = ENDED
-            break
-        else:
+        centre = step(step(p, radius * along, d), -radius * b, t)
+        left = bound - 2.0 * radius
+        if there and (left <= 0.0 or not sure):
+            there, around = holds(world, m, centre, sure)
+            bound, left = max(bound, around - radius), max(left, around - radius)
+        if there:
             met += 1
-            u = unit(bits)
-            grain = memory.grains[c, column, int(u * memory.kept[c])]
+            grain = memory.grains[c, column, number]
             if sampled:
-                pdf = memory.met[c] * density(tables, column_of(tables, c, float(grain[2])))
-                if not pdf > 0.0 or (grain[0] == 0.0 and grain[1] == 0.0):
-                    pdf = -1.0
+                bent, cosine = c if grain[0] != 0.0 or grain[1] != 0.0 else STRAIGHT, float(grain[2])
             d, t, b, n = sent(grain, d, t)
             p = step(centre, radius, n)
-            bound -= 2.0 * radius
+            bound, ahead = left, 0.0
             slot = media.slot[c]
             if slot >= 0:
                 length = media.scale[c] * float(grain[7])
@@ -332,6 +495,8 @@ def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of
                 luck += world.absorption.least[slot] * length
             key += GOLDEN
             bits = mix(key)
+        else:
+            through = 2.0 * along
         gap, t, b = onward(memory, m, d, t, b, bits)
         free = radius * (through + gap)
         if luck < DIM:
@@ -352,7 +517,7 @@ def roam(world, batch, w, amounts, once):  # noqa: C901 - all that can become of
     write(w.p, p)
     write(w.d, d)
     write(w.t, t)
-    w.b, w.key, w.free, w.luck, w.pdf = b, key, free, luck, pdf
+    w.b, w.key, w.free, w.luck, w.pdf = b, key, free, luck, drawn(world, w.pdf, bent, cosine)
     return state
 
 

@@ -106,7 +106,7 @@ def rove(world, batch, w, amounts):
     write(w.d, d)
     write(w.q, centre)
     w.key, w.component, w.luck = key, c, luck
-    w.mode, w.state, w.free, w.pdf = mode, state, -1.0, -1.0
+    w.mode, w.state, w.free, w.pdf, w.left = mode, state, -1.0, -1.0, 0
 
 
 @njit(**KERNEL)

@@ -94,15 +94,6 @@ class Passage:
 # ------------------------------------------------------------------------------------------- the chains
 
 
-@njit(forceinline=True, **KERNEL)
-def component(choice, first, last, u):
-    """Return the component that u stands for."""
-    c = first
-    while c < last and u >= choice[c]:
-        c += 1
-    return c
-
-
 @njit(**KERNEL)
 def drawn(chain, m, first, last, seed, sums):
     """Add up what the mean step needs over draws `first` to `last` of a level that draws free paths: cosines, z, the
@@ -112,7 +103,7 @@ def drawn(chain, m, first, last, seed, sums):
     end = begin + media.kinds[m] - 1
     for i in range(first, last):
         key = key_of(seed, i, 0)
-        c = component(media.choice, begin, end, sobol(i, 1, np.uint32(seed), SOBOL))
+        c = M.component(media.choice, begin, end, sobol(i, 1, np.uint32(seed), SOBOL))
         cosine, _, r, z, phi, _, key = deflection(chain, c, sobol(i, 0, np.uint32(seed), SOBOL), key)
         d, offset = leave((0.0, 0.0, 1.0), cosine, 0.0, r, z, phi)
         sums[0] += cosine
@@ -158,7 +149,7 @@ def flown(chain, m, job, ahead, out, crossed):
             c = begin
             if end > begin:
                 key += GOLDEN
-                c = component(media.choice, begin, end, unit(mix(key)))
+                c = M.component(media.choice, begin, end, unit(mix(key)))
             key += GOLDEN
             u0, u1 = halves(mix(key))
             cosine, _, r, z, phi, length, key = deflection(chain, c, u0, key)
@@ -194,7 +185,7 @@ def remembered(chain, m, job, ahead, aside, out, crossed):
             c = begin
             if end > begin:
                 key += GOLDEN
-                c = component(memory.choice, begin, end, unit(mix(key)))
+                c = M.component(memory.choice, begin, end, unit(mix(key)))
             column = min(int(b * b * memory.columns[c]), memory.columns[c] - 1)
             hit, met = memory.hit[c, column], True
             if hit < 1.0:

@@ -71,9 +71,10 @@ def triangle_distance(corners, p):
     uu, uv, vv, qu, qv = dot(u, u), dot(u, v), dot(v, v), dot(q, u), dot(q, v)
     det = uu * vv - uv * uv
     s, t = vv * qu - uv * qv, uu * qv - uv * qu
-    n, best = cross(u, v), math.inf
-    if s >= 0.0 and t >= 0.0 and s + t <= det and det > 0.0:
-        best = dot(q, n) ** 2 / dot(n, n)  # of a needle, s and t are mostly rounding: its edges count in any case
+    if s >= 0.0 and t >= 0.0 and s + t <= det and det > 0.0:  # of a needle that is mostly rounding: its plane is nearer
+        n = cross(u, v)
+        return abs(dot(q, n)) / math.sqrt(dot(n, n))
+    best = math.inf
     for k in range(3):
         o = a if k < 2 else step(a, 1.0, u)
         e = u if k == 0 else (v if k == 1 else step(v, -1.0, u))

@@ -76,6 +76,7 @@ from tsdf.walk.walker import (
     write,
 )  # fmt: skip
 
+NEXT = 6.0  # [R] how far the next grain is looked for before it is known where the medium ends
 HAIR = 1e-6  # of a boundary's thickness: an event nearer than this to it may be beyond it by rounding
 
 
@@ -469,8 +470,6 @@ def look(world, batch, w):
     end, way = math.inf, triple(w.d)
     if w.mode == JUMP:
         end, way = w.length, triple(w.e)
-    elif traits.packed:
-        pass
     elif w.shadow and not traits.remembers:  # farther, it will not survive its roulette; see `pass_through`
         end = world.media.free[w.medium] * math.log(w.weight / (FAINT * unit(mix(w.key + GOLDEN)) + 1e-300))
     elif w.free >= 0.0:
@@ -630,7 +629,7 @@ def fly(world, batch, w, amounts):
             if inside:
                 home = m
     if home != w.medium:
-        w.free = -1.0
+        w.free, w.left = -1.0, 0
     w.skip, w.tries, w.medium = 0.0, 0, home
     facing = abs(dot(n, d)) if t < math.inf else 1.0
     if home != NONE:
@@ -671,10 +670,12 @@ def pass_through(world, batch, w, amounts, t_b, t, thick):
         if w.shadow:
             return ENDED
         w.pdf = -1.0
-        s, centre, key = X.next_grain(world.grains, world.room, m, triple(w.p), triple(w.d), end)
-        if s < math.inf and t - s > thick:
-            enter(world, w, s, centre, key)
+        if w.free < 0.0:
+            X.find(world.grains, world.room, w, end)
+        if 0.0 <= w.free < end and t - w.free > thick:
+            enter(world, w)
             return LOOK
+        w.left = 0
     elif media.traits.remembers:
         if w.free < 0.0:
             M.begin(w, world.memory)
@@ -704,24 +705,31 @@ def pass_through(world, batch, w, amounts, t_b, t, thick):
 
 
 @njit(**KERNEL)
-def enter(world, w, s, centre, key):
-    """Bring a walker to a grain's bounding sphere at distance s and, if the grain is traced, into its frame."""
-    grains, media, m = world.grains, world.media, w.medium
+def enter(world, w):
+    """Bring a walker to the bounding sphere of the grain that was found and, if the grain is traced, into its frame."""
+    grains, media, m, centre, d = world.grains, world.media, w.medium, triple(w.e), triple(w.d)
     radius = grains.radius[m]
-    w.component = X.component_of(grains, media.first[m], media.kinds[m], key)
-    w.grain, w.mode, w.state, w.facet, w.pdf, w.ray = key, GRAIN, X.ENTERED, NONE, -1.0, NONE
+    w.component = X.component_of(grains, media.first[m], media.kinds[m], w.grain)
+    w.mode, w.state, w.left, w.facet, w.pdf, w.ray = GRAIN, X.ENTERED, w.facet, NONE, -1.0, NONE
     write(w.q, centre)
-    x = step(triple(w.p), s, triple(w.d))
+    x = step(triple(w.p), w.free, d)
     if media.traits.answered:
         write(w.p, x)
         return
     x = step(x, -1.0, centre)
     x = (x[0] / radius, x[1] / radius, x[2] / radius)
     size = 1.0 / math.sqrt(dot(x, x))
-    p = X.turned(key, (x[0] * size, x[1] * size, x[2] * size), True)
-    write(w.p, p)
-    write(w.e, p)
-    write(w.d, X.turned(key, triple(w.d), True))
+    x = (x[0] * size, x[1] * size, x[2] * size)
+    axis, w.b = (0.0, 0.0, 0.0), 1.0
+    if grains.exemplar[w.component] != X.EXACT_SPHERE:  # which looks the same from all sides
+        a, b, c, w.b = X.rotation(w.grain)
+        axis = (a, b, c)
+        back = (-a, -b, -c)
+        x, d = X.rotated(back, w.b, x), X.rotated(back, w.b, d)
+    write(w.t, axis)
+    write(w.p, x)
+    write(w.e, x)
+    write(w.d, d)
 
 
 @njit(**KERNEL)
@@ -750,9 +758,9 @@ def in_grain(world, batch, w, amounts, facet):
         w.events += 1
         w.single += 1
     p = step(p, X.rim_of(p, d), d)
-    out = X.turned(w.grain, p, False)
-    write(w.p, step(triple(w.q), grains.radius[w.medium], out))
-    write(w.d, renewed(X.turned(w.grain, d, False)))
+    axis = triple(w.t)
+    write(w.p, step(triple(w.q), grains.radius[w.medium], X.rotated(axis, w.b, p)))
+    write(w.d, renewed(X.rotated(axis, w.b, d)))
     w.mode, w.free = FLY, -1.0
     if w.events >= media.limit:
         batch.counters[TRUNCATED] += 1
@@ -788,18 +796,36 @@ def meet_grain(world, batch, w, amounts):
     return in_grain(world, batch, w, amounts, facet)
 
 
+@njit(forceinline=True, **KERNEL)
+def go_to_grain(world, w):
+    """Take a walker in a known medium to the next grain if that is surely nearer than all else; return LOOK, or CLEAR
+    if it must look, for which the grain is kept if one was found, and that there is none if that is sure."""
+    g, m = world.geometry, w.medium
+    bound = clearance(g, m, triple(w.p))
+    if not bound > 0.0:
+        return CLEAR
+    far, end = max(bound, NEXT * world.grains.radius[m]), math.inf
+    if g.kind[m] != MESH:
+        t, inside, _ = exact_hit(g.kind[m], g.shape[m], triple(w.p), triple(w.d))
+        if inside and t < math.inf:
+            far = end = t
+            if alone(g, m):
+                bound = max(bound, t - HAIR * GRAZING * g.slack[m])
+    X.find(world.grains, world.room, w, far)
+    if 0.0 <= w.free < bound:
+        enter(world, w)
+        return LOOK
+    if w.free < 0.0 and far == end:
+        w.free = math.inf
+    return CLEAR
+
+
 @njit(**KERNEL)
 def go_deep(world, batch, w, amounts):
     """Take a walker in a known medium as far as it is sure to meet nothing; return CLEAR if it must look, else what
     becomes of it."""
     if world.media.traits.packed:
-        bound = clearance(world.geometry, w.medium, triple(w.p))
-        if bound > 0.0:
-            s, centre, key = X.next_grain(world.grains, world.room, w.medium, triple(w.p), triple(w.d), bound)
-            if s < math.inf:
-                enter(world, w, s, centre, key)
-                return LOOK
-        return CLEAR
+        return go_to_grain(world, w)
     if w.skip != 0.0:
         return CLEAR
     if world.media.traits.remembers:
@@ -923,7 +949,7 @@ def spawn(batch, live, job, first, count):
             w.colour[k] = 1.0
         w.weight, w.luck, w.pdf, w.free, w.skip = 1.0, 0.0, -1.0, -1.0, 0.0
         w.key, w.events, w.sample, w.ray, w.medium, w.mode = key + GOLDEN, 0, local, NONE, UNKNOWN, FLY
-        w.tries, w.shadow, w.single = 0, 0, 0
+        w.tries, w.shadow, w.single, w.left = 0, 0, 0, 0
         if job.met.shape[0] > 0:
             w.single = job.met[pixel]
         for k in range(batch.amounts.shape[1]):

@@ -20,14 +20,16 @@ WALKER = np.dtype(
      ("luck", "f8"), ("pdf", "f8"), ("free", "f8"), ("length", "f8"), ("gained", "f8"), ("skip", "f8"), ("b", "f8"),
      ("key", "u8"), ("grain", "u8"),
      ("events", "i8"), ("sample", "i4"), ("ray", "i4"), ("medium", "i4"), ("mode", "i4"), ("component", "i4"),
-     ("facet", "i4"), ("state", "i4"), ("tries", "i4"), ("shadow", "i4"), ("single", "i4")]
+     ("facet", "i4"), ("state", "i4"), ("tries", "i4"), ("shadow", "i4"), ("single", "i4"), ("left", "i4")]
 )  # fmt: skip
 # p, d: place and direction. q, e, length, gained: of a jump, the direction after it, its own, its length and what it
 # adds to the amounts; in a grain, q is its centre, e where the ray starts. luck: logarithm of a bound of the
 # throughput. pdf: density per steradian with which d was drawn, -1 for none. free: the free path still to fly, < 0 if
 # not drawn. skip: how far beyond p the ray engine starts. ray: row of the ray engine's answers, -1 for none. t, b: of
-# the bounding sphere at the end of the free path, the side on which it is entered and the impact parameter [R]. single:
-# grains met one by one so far.
+# the bounding sphere at the end of the free path, the side on which it is entered and the impact parameter [R]; in a
+# grain, how it is turned. single: grains met one by one so far. left: number of the packed sphere with centre q where
+# it is or which it has just left, from 1 on, 0 for none. Where grains are packed, free is how far the next is, if it is
+# known, e its centre, grain its key and facet its number.
 FLY, JUMP, GRAIN = 0, 1, 2
 
 EVENTS, RAYS, TRUNCATED, FAULTS, LEAPT, LEAPS = range(6)  # counters; LEAPT of the events, in so many LEAPS
@@ -216,7 +218,7 @@ def cast(w, shadow, p, toward, light, weight, m, key):
     shadow.weight, shadow.luck, shadow.pdf, shadow.free = 1.0, 0.0, -1.0, -1.0
     shadow.skip, shadow.key, shadow.events = 0.0, key, 0
     shadow.sample, shadow.ray, shadow.medium, shadow.mode = w.sample, NONE, m, FLY
-    shadow.tries, shadow.shadow, shadow.single = 0, 1, w.single
+    shadow.tries, shadow.shadow, shadow.single, shadow.left = 0, 1, w.single, 0
 
 
 @njit(**KERNEL)
