@@ -193,9 +193,9 @@ def way_ahead(g, met, m, p, d, free, far):
         far = min(far, (t - NEAR * g.balls[ball, 3]) / (1.0 + NEAR))
     if far <= free or g.engines == 0:
         return far, False
-    if not march(g.grid, met, p, d, far):
+    if not march(g.grid, met, m, p, d, far):
         far = free
-        if not march(g.grid, met, p, d, far):
+        if not march(g.grid, met, m, p, d, far):
             return 0.0, False
         far = math.nextafter(far, math.inf)
     for e in range(met.shape[0]):
