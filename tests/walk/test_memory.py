@@ -19,7 +19,8 @@ from tsdf.spheres.packing import cells_of, next_sphere, pack
 from tsdf.spheres.packing_table import law
 from tsdf.study.experiment import diffusion, slab
 from tsdf.walk import memory
-from tsdf.walk.memory import begin, memory_of, onward, remembered
+from tsdf.walk.memory import begin, onward
+from tsdf.walk.records import AIMED, _aimed, memory_of, remembered
 from tsdf.walk.walker import ENDED, FAULTS, FLY, MOST, WALKER
 
 CAMERA = Camera((0.0, 0.0, 10.0), (0.0, 0.0, 0.0), 1, 1, up=(0.0, 1.0, 0.0))
@@ -103,7 +104,7 @@ def test_light_keeps_to_the_plane_of_a_sphere(ball: Table) -> None:
 def test_records_for_aimed_light_are_of_their_column(cube: Table) -> None:
     """Where a column of cos theta has records, those that stand for it lie in it, by the light that they are."""
     k = len(cube.memory["l"])
-    chosen = memory._aimed(cube, k)
+    chosen = _aimed(cube, k)
     cosines = cube.memory["cos_theta"].T.ravel()[chosen]
     edges = cube.cos_theta_edges
     full = (
@@ -123,7 +124,7 @@ def test_records_for_aimed_light_are_whole(ball: Table, cube: Table) -> None:
         known = {
             (*record.tolist(), float(np.float32(at))) for record, at in zip(records.reshape(-1, 8), b.flat, strict=True)
         }
-        assert aimed.shape == (len(table.cos_theta_edges) - 1, memory.AIMED, 9)
+        assert aimed.shape == (len(table.cos_theta_edges) - 1, AIMED, 9)
         assert all(tuple(one) in known for one in aimed.reshape(-1, 9).tolist())
         d, side, out = (aimed[..., i].astype(np.float64) for i in (slice(0, 3), slice(3, 6), slice(6, 7)))
         normal = out * side + np.sqrt(1.0 - out**2) * d

@@ -49,7 +49,8 @@ from tsdf.walk.geometry import MESH, Place, Triangles, ball_hit, exact_hit, plac
 from tsdf.walk.hybrid import ALL, hybrid_notes, singles_of
 from tsdf.walk.leaps import Leaps
 from tsdf.walk.lights import LightArrays, compile_lights
-from tsdf.walk.memory import Memory, memory_of
+from tsdf.walk.memory import Memory
+from tsdf.walk.records import memory_of
 from tsdf.walk.transport import NOBODY, CameraArrays
 from tsdf.walk.walker import MAX_EVENTS, Attenuation, Media
 
