@@ -86,3 +86,16 @@ def test_the_next_grain_is_the_first_that_stands(fraction: float) -> None:
             assert w["free"] == pytest.approx(r * t, abs=1e-9)
             w["q"], w["left"] = w["e"], w["facet"]
     assert passed > 500 and missed > 200 and missed < 1_999
+
+
+def test_a_grain_is_found_however_far_away() -> None:
+    """A ray that passes 20,000 spheres without a grain meets the first one that has its centre in the box."""
+    box = Box((0.0, -4.0, -4.0), (4.0, 4.0, 4.0))
+    medium = MediumSpec(box, 0.5, 1.0, (GrainSpec(SALT),), inside="centres")
+    scene = Scene(Camera((0.0, -25.0, 12.0), (0.0, 0.0, 0.0), 4, 4), (ConstantLight((1.0,) * 3),), (medium,))
+    made = world.build(scene, "explicit")
+    handles, w = (Handle(made.packed.arrays), Handle(made.place.room)), np.zeros(1, WALKER)[0]
+    w["p"], w["d"] = (-25_000.0, 0.1, 0.2), (1.0, 0.0, 0.0)
+    find(*handles, w, 1e5)
+    assert abs(w["e"]).max() <= 4.0
+    assert np.linalg.norm(w["p"] + w["free"] * w["d"] - w["e"]) == pytest.approx(1.0, abs=1e-9)

@@ -382,12 +382,14 @@ def test_deflections_of_the_exact_sphere(kept_apart: bool) -> None:
 def test_rotations_are_uniform() -> None:
     """A turned axis is uniform on the sphere, its azimuth too, and turning back undoes it."""
     n = 40_000
-    turned = np.array([explicit.turned(keyed(i), (0.6, 0.0, 0.8), False) for i in range(n)])
+    quaternions = [explicit.rotation(keyed(i)) for i in range(n)]
+    turned = np.array([explicit.rotated(q[:3], q[3], (0.6, 0.0, 0.8)) for q in quaternions])
     for values in (turned[:, 2], np.arctan2(turned[:, 1], turned[:, 0]) / math.pi, turned[:, 0]):
         counts = np.histogram(values, 40, (-1.0, 1.0))[0]
         assert chi_square_p(counts, np.full(40, n / 40)) > 1e-3
     assert chi_square_p(np.histogram(turned[:, 2] ** 2, 40, (0.0, 1.0))[0], np.full(40, n / 40)) < 1e-6
-    back = explicit.turned(keyed(9), explicit.turned(keyed(9), (0.6, 0.0, 0.8), False), True)
+    x, y, z, w = quaternions[9]
+    back = explicit.rotated((-x, -y, -z), w, tuple(turned[9]))
     assert back == pytest.approx((0.6, 0.0, 0.8), abs=1e-12)
 
 

@@ -135,12 +135,13 @@ def nearest(around, sphere, n, d):
 @njit(**KERNEL)
 def across(around, p, d, start, most):
     """Return the sphere that light meets first along d from p, anywhere, in wide cells; its number and tile, -1 and
-    zeros if there is none between the distances `start` and `most` or `ENDLESS`; to about 1e-6 R, as float32 is."""
+    zeros if there is none from the distance `start` to `most`, or `ENDLESS` beyond `start`; to about 1e-6 R, as float32
+    is."""
     side, m = around.side, around.m
     edge, per_edge = side / m, m / side
     px, py, pz = p
     dx, dy, dz = d
-    end = min(most, ENDLESS)
+    end = min(most, start + ENDLESS)
     gx, gy, gz = (
         math.floor((px + start * dx) * per_edge),
         math.floor((py + start * dy) * per_edge),

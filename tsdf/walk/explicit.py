@@ -98,6 +98,7 @@ def find(grains, room, w, t_max):
         i, j, k = i + int(home[0]), j + int(home[1]), k + int(home[2])
     else:
         sphere, i, j, k = beyond(cells, around, o, d, 0.0, most)
+    start = 0.0
     while sphere >= 0:
         centre = centre_of(grains, m, i, j, k, sphere)
         away = step(centre, -1.0, p)
@@ -106,10 +107,10 @@ def find(grains, room, w, t_max):
             w.free, w.grain, w.facet = r * s, named(grains, m, i, j, k, sphere), sphere + 1
             write(w.e, centre)
             return
-        before = (sphere, i, j, k)
-        sphere, i, j, k = beyond(cells, around, o, d, s + HARDLY, most)
+        before, start = (sphere, i, j, k), max(s, start) + HARDLY
+        sphere, i, j, k = beyond(cells, around, o, d, start, most)
         if (sphere, i, j, k) == before:  # hardly touched, it seems to be farther
-            _, i, j, k, sphere = next_sphere(cells, o, d, s + HARDLY, most)
+            _, i, j, k, sphere = next_sphere(cells, o, d, start, most)
 
 
 @njit(**KERNEL)
@@ -141,13 +142,6 @@ def rotation(key):
     c2, s2 = on_circle(unit(mix(key + np.uint64(3))))
     a, b = math.sqrt(1.0 - u), math.sqrt(u)
     return a * s1, a * c1, b * s2, b * c2
-
-
-@njit(**KERNEL)
-def turned(key, v, back):
-    """Return a triple turned by the rotation of a grain's key, or turned back."""
-    x, y, z, w = rotation(key)
-    return rotated((-x, -y, -z) if back else (x, y, z), w, v)
 
 
 @njit(forceinline=True, **KERNEL)
