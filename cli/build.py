@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from tsdf.make.scatterometer import Build
     from tsdf.make.scatterometer import Progress as Done
 
-NEAR = 3.0  # times the target, an error from which on what it still takes is known to a factor of two, by trials
+NEAR = 2.0  # times the target, an error from which on what it still takes is known to a factor of two, by trials
 LONG_S = 600.0  # [s] what takes longer deserves a note
 DEFAULT_MATERIAL, DEFAULT_WAVELENGTH_NM = "ice", 550.0
 

@@ -641,3 +641,26 @@ def test_errors_of_hundreds_of_per_cent_are_explained(far: Plan) -> None:
     assert "16 by 16" not in report._first(far)
     noisy = replace(made, predictions=(replace(p, variance=16.0), *far.predictions[1:]), glints=300.0)
     assert "mostly noise until 5 min" in report._first(noisy)
+
+
+def test_few_samples_are_not_spent_on_glints(ball: tsdf.Table) -> None:
+    """Of so many samples a level is chosen whose noise with them is about the least, and of these one that misses less
+    than the target; where nobody knows glints from noise, not level explicit, though it alone misses nothing."""
+    run = planner._Planning(pile(ball, 160.0), 0.02, None, 0, 1)
+    run.spp = 8
+
+    def one(level: str, variance: float, floor: float, turn: float) -> Prediction:
+        return Prediction(
+            Candidate(level), 0.0, 0.0, floor, 0.0, Belief(floor, 0.1 * floor) if floor else CERTAIN, variance, turn,
+            piloted=True, known=True,
+        )  # fmt: skip
+
+    glinting = [one("explicit", 7500.0, 0.0, 1.0), one("teleport", 0.16, 1.3, 0.5), one("volume", 0.16, 1.35, 0.3)]
+    run.rarer = 100.0
+    assert run.choose(glinting).candidate.level == "teleport"
+    run.rarer = 1.0
+    plain = [one("explicit", 0.16, 0.0, 1.0), one("teleport", 0.16, 0.01, 0.5), one("volume", 0.16, 0.05, 0.3)]
+    assert run.choose(plain).candidate.level == "teleport"
+    run.spp = 4096
+    assert run.choose(plain).candidate.level == "teleport"
+    assert run.choose(plain[::2]).candidate.level == "explicit"

@@ -297,7 +297,7 @@ def build(
             notes.append(
                 f"{scene.name}: {called('medium', number, medium.name)}: a grain of diameter {2.0 * medium.radius:g} "
                 f"does not fit into the medium, which is {extent:.3g} thin: "
-                + ("no grain is there" if singles else "it is filled as if with smaller grains")
+                + ("no grain is there" if singles or traits.remembers else "it is filled as if with smaller grains")
                 + '; take smaller grains, or inside = "centres"'
             )
     lights, said = _lights(scene)

@@ -193,7 +193,11 @@ class _Planning(Evidence):
 
     def unfinished(self, p: Prediction) -> bool:
         """Return whether single grains under small suns are still but bright dots after the time that there is."""
-        return self.rarer > 1.0 and singly(p.candidate) and p.noise(self.limit / self.load) > UNFINISHED
+        return self.rarer > 1.0 and singly(p.candidate) and p.noise(self.able(p)) > UNFINISHED
+
+    def able(self, p: Prediction) -> float:
+        """Return the time that there is [s], or that the samples asked for take."""
+        return self.limit / self.load if self.spp is None else p.turn * self.spp
 
     def settled(self) -> tuple[Prediction, list[Prediction]]:
         """Return what is chosen, which a pilot has seen where one can, and all predictions."""
@@ -489,12 +493,17 @@ class _Planning(Evidence):
 
     def choose(self, found: list[Prediction]) -> Prediction:
         """Return the cheapest that is sure enough to meet the target; if there is a time and none does, the one with
-        the least error in it, of those that aim at small suns. None is taken of whose noise nothing is known, unless
+        the least error in it, of those that aim at small suns. With so many samples it is the cheapest of
+        those whose noise is about the least, or small enough, and that miss less than the target. None is taken of whose noise nothing is known, unless
         nothing is of any."""
         found = [p for p in found if math.isfinite(p.variance)] or found
         if self.spp is not None:
-            fit = [p for p in found if p.floor.high < self.target]
-            return min(fit, key=lambda p: p.turn) if fit else min(found, key=lambda p: p.floor.high)
+            after = {p.candidate: p.likely_error(self.able(p)) for p in found}
+            aimed = [p for p in found if not self.unfinished(p)] or found
+            enough = max(self.target, TIE * min(after[p.candidate] for p in aimed))
+            alike = [p for p in aimed if after[p.candidate] <= enough] or aimed  # of pilots without light
+            fit = [p for p in alike if p.floor.high < self.target]
+            return min(fit, key=lambda p: p.turn) if fit else min(alike, key=lambda p: p.floor.high)
         best = min(found, key=lambda p: p.safe_seconds(self.target))
         takes = best.safe_seconds(self.target)
         limit = self.limit / self.load

@@ -155,7 +155,7 @@ def _other(plan: Plan) -> str:
     if lower:
         changes.append(f"a target below {percent(max(lower))} ({flips[max(lower)].candidate})")
     if upper:
-        changes.append(f"one above {percent(min(upper))} ({flips[min(upper)].candidate})")
+        changes.append(f"{'one' if lower else 'a target'} above {percent(min(upper))} ({flips[min(upper)].candidate})")
     return (
         f"{runner}; {' or '.join(changes)} would change this"
         if changes
