@@ -238,8 +238,8 @@ def main() -> None:
     """Print the comparison and its summary."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", help="how names of scenes begin, comma-separated")
-    for name, said in (("drawn", "drawn by `plan_draws`"), ("glints", "likewise, of what sparkles")):
-        parser.add_argument(f"--{name}", metavar="FIRST:LAST", help=f"seeds of scenes {said}, and none else")
+    for name, said in (("--drawn", "drawn by `plan_draws`"), ("--glints", "likewise, of what sparkles")):
+        parser.add_argument(name, metavar="FIRST:LAST", help=f"seeds of scenes {said}, and none else")
     parser.add_argument("--kept", type=Path, help="folder where what is measured of scenes is kept and taken from")
     parser.add_argument("--truth", type=float, default=30.0, help="seconds of the truth")
     parser.add_argument("--each", type=float, default=6.0, help="seconds of each candidate")

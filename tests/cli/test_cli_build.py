@@ -139,7 +139,7 @@ def test_a_quality_says_how_long_first(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter((0.0, 60.0, 61.0, 62.0, 63.0))
     monkeypatch.setattr(time, "monotonic", lambda: next(clock))
     tell(Progress())
-    for paths, error in ((1000, 0.05), (2000, 0.04), (3000, 0.02), (4000, 0.02)):
+    for paths, error in ((1000, 0.05), (2000, 0.04), (3000, 0.015), (4000, 0.015)):
         assert not noted or paths > 3000
         tell(Progress(paths, 33_000, 0, TableError(64, error, 0.0)))
     (note,) = noted

@@ -18,7 +18,8 @@ from click.testing import CliRunner, Result
 from tsdf.cli import common
 from tsdf.cli.render import main
 from tsdf.errors import TSDFError
-from tsdf.picture import image, world
+from tsdf.picture import image
+from tsdf.plan import shot
 from tsdf.reference_data.make_checks import CHECKS
 
 WIDTH, HEIGHT = 12, 8
@@ -261,7 +262,7 @@ def test_getting_ready_leaves_nothing_to_keep(folder: Path, monkeypatch: pytest.
         raise TSDFError(f"an interrupt means: {works[0].meaning()}")
 
     monkeypatch.setattr(common, "Work", Known)
-    monkeypatch.setattr(world, "build", build)
+    monkeypatch.setattr(shot, "build", build)
     assert run(folder).stderr.endswith("an interrupt means: nothing is written\n")
 
 

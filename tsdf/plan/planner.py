@@ -493,9 +493,9 @@ class _Planning(Evidence):
 
     def choose(self, found: list[Prediction]) -> Prediction:
         """Return the cheapest that is sure enough to meet the target; if there is a time and none does, the one with
-        the least error in it, of those that aim at small suns. With so many samples it is the cheapest of
-        those whose noise is about the least, or small enough, and that miss less than the target. None is taken of whose noise nothing is known, unless
-        nothing is of any."""
+        the least error in it, of those that aim at small suns. With so many samples it is the cheapest of those whose
+        noise is about the least, or small enough, and that miss less than the target. None is taken of whose noise
+        nothing is known, unless nothing is of any."""
         found = [p for p in found if math.isfinite(p.variance)] or found
         if self.spp is not None:
             after = {p.candidate: p.likely_error(self.able(p)) for p in found}
