@@ -20,7 +20,7 @@ from tsdf.vectors import KERNEL, dot
 STEPS = 64  # of a ray through the grid; the ray engine is faster with those that need more
 OUTSIDE = 16  # facets that reach out of the grid, with more of which rays that leave it are left to the ray engine
 MOST_LISTED = 2e7  # facets in all cells, about: cells of very many large facets are larger
-FEW_LISTED, EACH_LISTED = 4e5, 30  # the most there, and for each facet more: a wide floor needs no fine cells
+FEW_LISTED, EACH_LISTED = 4e5, 200  # the most there, and for each facet more: a wide floor needs no fine cells
 BATCH = 1 << 17  # triangles and boxes that are looked at together
 PAD = 0.004  # [cells] facets count as in a cell when this near to it, far more than the rounding of the way through
 GRAZING = 100.0  # times its thickness is the most that a point is moved off a facet along a ray
