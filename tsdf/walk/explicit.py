@@ -134,7 +134,7 @@ def tile(x, per_side, half):
     )
 
 
-@njit(forceinline=True, **KERNEL)
+@njit(**KERNEL)
 def rotation(key):
     """Return the uniformly random rotation (Shoemake 1992) of a grain's key, a quaternion (x, y, z, w)."""
     u = unit(mix(key + np.uint64(1)))
@@ -144,7 +144,7 @@ def rotation(key):
     return a * s1, a * c1, b * s2, b * c2
 
 
-@njit(forceinline=True, **KERNEL)
+@njit(**KERNEL)
 def rotated(axis, w, v):
     """Return a triple turned by the quaternion of vector `axis` and scalar w."""
     x, y, z = axis

@@ -75,7 +75,7 @@ def _between(low, high, at, d):
     return min(low, high), max(low, high), begins
 
 
-@njit(forceinline=True, **KERNEL)
+@njit(**KERNEL)
 def exact_hit(kind, shape, p, d):
     """Return distance to a slab, box or ball, whether p is inside, and the outward normal there."""
     if kind == BALL:

@@ -209,7 +209,7 @@ def holds(world, m, centre, sure):
     return bound >= world.memory.radius[m] or stands(world.room, m, centre), bound
 
 
-@njit(forceinline=True, **KERNEL)
+@njit(**KERNEL)
 def darkened(world, m, p, d, side, key, bound):
     """Return whether a shadow meets a grain in the sphere that it enters at p, with `side` = (t, b), and the key that
     is used up; nothing is nearer to p than `bound`."""

@@ -796,7 +796,7 @@ def meet_grain(world, batch, w, amounts):
     return in_grain(world, batch, w, amounts, facet)
 
 
-@njit(forceinline=True, **KERNEL)
+@njit(**KERNEL)
 def go_to_grain(world, w):
     """Take a walker in a known medium to the next grain if that is surely nearer than all else; return LOOK, or CLEAR
     if it must look, for which the grain is kept if one was found, and that there is none if that is sure."""
