@@ -55,3 +55,10 @@ def renewed(d):
     """Return a nearly unit vector with unit length, by a step of Newton's: keeps rounding errors from piling up."""
     half = 1.5 - 0.5 * dot(d, d)
     return d[0] * half, d[1] * half, d[2] * half
+
+
+@njit(forceinline=True, **KERNEL)
+def unit_of(v):
+    """Return the unit vector along a triple."""
+    size = 1.0 / math.sqrt(dot(v, v))
+    return v[0] * size, v[1] * size, v[2] * size

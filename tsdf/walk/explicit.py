@@ -25,7 +25,7 @@ from tsdf.sampling import GOLDEN, key_of, mix, unit
 from tsdf.scene.scene import GrainSpec, Scene, called
 from tsdf.spheres.around import ENDLESS, Around, across, around_of, entered, next_around
 from tsdf.spheres.packing import Cells, cells_of, next_sphere, pack
-from tsdf.vectors import KERNEL, dot, renewed, step, triple
+from tsdf.vectors import KERNEL, dot, renewed, step, triple, unit_of
 from tsdf.walk.geometry import NONE, planes_of
 from tsdf.walk.room import stands
 from tsdf.walk.walker import write
@@ -183,9 +183,7 @@ def through_sphere(p, d, eta, kept_apart, key):
     length = 0.0
     d = step((d[0] / eta, d[1] / eta, d[2] / eta), cos_i / eta - cos_t, p)
     while True:
-        p = step(p, 2.0 * cos_t, d)
-        size = 1.0 / math.sqrt(dot(p, p))
-        p = (p[0] * size, p[1] * size, p[2] * size)
+        p = unit_of(step(p, 2.0 * cos_t, d))
         length += 2.0 * cos_t
         key = mix(key + GOLDEN)
         if unit(key) >= reflectance:

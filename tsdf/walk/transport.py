@@ -30,7 +30,7 @@ from tsdf.data.sampler import (
     turned,
 )
 from tsdf.sampling import GOLDEN, key_of, mix, unit
-from tsdf.vectors import KERNEL, cross, dot, frame, minus, renewed, step, triple
+from tsdf.vectors import KERNEL, cross, dot, frame, minus, renewed, step, triple, unit_of
 from tsdf.walk import explicit as X
 from tsdf.walk import memory as M
 from tsdf.walk.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit, unmet
@@ -225,13 +225,6 @@ def connect(world, batch, w, amounts, p, c, share, bound):
             if sure:
                 shadow.mode = FLY
                 write(shadow.p, end)
-
-
-@njit(forceinline=True, **KERNEL)
-def unit_of(v):
-    """Return the unit vector along v."""
-    norm = 1.0 / math.sqrt(dot(v, v))
-    return v[0] * norm, v[1] * norm, v[2] * norm
 
 
 @njit(**KERNEL)
@@ -718,8 +711,7 @@ def enter(world, w):
         return
     x = step(x, -1.0, centre)
     x = (x[0] / radius, x[1] / radius, x[2] / radius)
-    size = 1.0 / math.sqrt(dot(x, x))
-    x = (x[0] * size, x[1] * size, x[2] * size)
+    x = unit_of(x)
     axis, w.b = (0.0, 0.0, 0.0), 1.0
     if grains.exemplar[w.component] != X.EXACT_SPHERE:  # which looks the same from all sides
         a, b, c, w.b = X.rotation(w.grain)
