@@ -22,32 +22,47 @@ from numba.extending import intrinsic
 from tsdf.compiled import njit
 from tsdf.data.sampler import leave
 from tsdf.sampling import GOLDEN, key_of, mix, unit
-from tsdf.vectors import KERNEL, dot, renewed, step
-from tsdf.walk.grid import GRAZING
-from tsdf.walk.lights import radiance as light_from
-from tsdf.walk.room import BOX, SLAB
-from tsdf.walk.transport import HAIR, deflection
-from tsdf.walk.walker import EVENTS, FLY, PATIENCE, UNKNOWN, absorbed, copy, halves, write
+from tsdf.vectors import KERNEL, dot, renewed, step, triple
 from tsdf.walk.geometry import NONE
+from tsdf.walk.grid import GRAZING
+from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, ROOM, leap, missing, patience
+from tsdf.walk.lights import radiance as light_from
+from tsdf.walk.room import SLAB
+from tsdf.walk.transport import HAIR, aimed, carried, deflection
+from tsdf.walk.walker import (
+    DIM,
+    EVENTS,
+    FAINT,
+    FLY,
+    OTHER,
+    PATIENCE,
+    absorbed,
+    copy,
+    halves,
+    lives,
+    power,
+    write,
+)
 
 WIDTH = 128  # lanes that walk; as many more hold samples that are about to
 STRIDE = 2 * WIDTH + 8  # of one number of all lanes: no power of two, or all would want one line of the cache
 STEPS = 4096  # of all lanes together, before others have their turn
 
-# Numbers of a lane: those that go with its walker first, then those of one step
-PX, PY, PZ, DX, DY, DZ, PDF, FREE, BOUND, LUCK, WEIGHT, COSINE, TURN, R, Z, PHI, SCALE, LENGTH = range(18)
-KEPT, NUMBERS = 11, 18
-KEY, SAMPLE, MET, ONCE, STATE = range(5)  # words of a lane
-WORDS = 5
-WALKS, LIGHT, LOST = range(3)  # what a lane's STATE says: it goes on, has found light, or is handed over
+# Numbers of a lane: those that go with its walker; those of a step; and those of light that is aimed into it
+PX, PY, PZ, DX, DY, DZ, PDF, FREE, BOUND, LUCK, WEIGHT, WAITS = range(12)
+WAY, COSINE, TURN, R, Z, PHI, LENGTH, BACK, TX, TY, TZ, RED, GREEN, BLUE = range(12, 26)
+KEPT, NUMBERS = 12, 26
+KEY, SAMPLE, MET, ONCE, STATE, KIND, AIMED, OTHER_KEY = range(8)  # words of a lane
+WORDS_KEPT, WORDS = 6, 8
+WALKS, LIGHT, LOST, DEAD = range(4)  # STATE of a lane: it goes on, finds light, is handed over, or roulette ended it
 LIVE, NEXT, READY, HANDED = range(4)  # of `Lanes.counts`
 
 
 class Lanes(NamedTuple):
     """Walkers in lanes.
 
-    numbers (NUMBERS * STRIDE,), words (WORDS * STRIDE,) uint64, amounts (2 WIDTH, a): of the lanes that walk, from 0
-    on, and from WIDTH on of those that are about to; gone, ready (WIDTH,): lanes whose walk has ended, and that can be
+    numbers (NUMBERS * STRIDE,), words (WORDS * STRIDE,) uint64, amounts (2 WIDTH + 1, a): of the lanes that walk, from
+    0 on, and from WIDTH on of those that are about to, and room for a shadow's amounts; gone, ready (WIDTH,): lanes whose walk has ended, and that can be
     taken; counts (4,): lanes that walk, the next sample, how many are ready, walkers handed over.
     """
 
@@ -62,7 +77,7 @@ class Lanes(NamedTuple):
 def lanes_of(amounts: int) -> Lanes:
     """Return lanes without walkers, for so many amounts."""
     return Lanes(
-        np.zeros(NUMBERS * STRIDE), np.zeros(WORDS * STRIDE, np.uint64), np.zeros((2 * WIDTH, amounts)),
+        np.zeros(NUMBERS * STRIDE), np.zeros(WORDS * STRIDE, np.uint64), np.zeros((2 * WIDTH + 1, amounts)),
         np.zeros(WIDTH, np.int64), np.zeros(WIDTH, np.int64), np.zeros(4, np.int64),
     )  # fmt: skip
 
@@ -214,7 +229,7 @@ def begin(lanes, job, first, count):
 
 
 @njit(**KERNEL)
-def arrive(g, lanes, count):
+def arrive(g, leaps, lanes, count):
     """Bring the samples that are ready to where they come inside, or let them find light; see `transport.fly`."""
     numbers, words, slack = lanes.numbers, lanes.words, g.slack[0]
     low, high = sides(g)
@@ -225,21 +240,30 @@ def arrive(g, lanes, count):
         move = 0.0 if inside else (near + slack * min(1.0 / abs(along), GRAZING) if met else 0.0)
         p = step(p, move, d)
         put(numbers, PX, i, p)
-        numbers[at(PDF, i)], numbers[at(FREE, i)] = -1.0, -1.0
-        numbers[at(BOUND, i)] = depth(low, high, p)
+        numbers[at(PDF, i)], numbers[at(FREE, i)], numbers[at(BOUND, i)] = -1.0, -1.0, depth(low, high, p)
         numbers[at(LUCK, i)], numbers[at(WEIGHT, i)] = 0.0, 1.0
-        words[at(MET, i)] = np.uint64(0) if inside else np.uint64(1)
-        words[at(ONCE, i)] = np.uint64(1) if inside else np.uint64(0)
+        words[at(MET, i)], words[at(ONCE, i)] = np.uint64(not inside), np.uint64(inside)
         words[at(STATE, i)] = np.uint64(WALKS) if inside or met else np.uint64(LIGHT)
+    for i in range(WIDTH, WIDTH + count):
+        numbers[at(WAITS, i)] = wait(leaps, words[at(ONCE, i)], numbers[at(BOUND, i)])
+        for k in range(lanes.amounts.shape[1]):
+            lanes.amounts[i, k] = 0.0
+
+
+@njit(forceinline=True, **KERNEL)
+def wait(leaps, once, bound):
+    """Return after how many events a leap is asked for where `transport.wander` begins anew, with so much clearance."""
+    return float(NEVER if once != np.uint64(0) else patience(leaps, 0, missing(leaps, 0, bound)))
 
 
 # ------------------------------------------------------------------------------------------- steps
 
 
 @njit(**KERNEL)
-def fly(g, media, lanes, first, last):
-    """Take the lanes first .. last - 1 along a free path, to a grain or out."""
-    numbers, words, mean, hair = lanes.numbers, lanes.words, media.free[0], HAIR * g.slack[0]
+def fly(world, lanes, first, last):
+    """Take the lanes first .. last - 1 along a free path, to a grain or out; see `transport.wander`."""
+    g, media, numbers, words = world.geometry, world.media, lanes.numbers, lanes.words
+    mean, hair = media.free[0], HAIR * g.slack[0]
     low, high = sides(g)
     most = np.uint64(min(PATIENCE, media.limit) - 1)
     for i in range(first, last):
@@ -250,105 +274,261 @@ def fly(g, media, lanes, first, last):
         free = free if drawn else -mean * logarithm(1.0 - unit(mix(key)))
         end = step(p, free, d)
         there = depth(low, high, end)
-        inside = bound > 0.0
         short = bound <= free
-        once = words[at(ONCE, i)] != np.uint64(0)
-        out = short and there - hair <= 0.0
-        left = (there - hair + free) - free if short else bound - free
         walks = words[at(STATE, i)] == np.uint64(WALKS)
-        lost = not inside or words[at(MET, i)] >= most
+        lost = not bound > 0.0 or words[at(MET, i)] >= most
+        out = short and there - hair <= 0.0
+        ends = lost or out
         state = np.uint64(LOST) if lost else (np.uint64(LIGHT) if out else np.uint64(WALKS))
-        stays = lost or out
+        left = (there - hair + free) - free if short else bound - free
         words[at(KEY, i)] = key
         words[at(STATE, i)] = state if walks else words[at(STATE, i)]
-        put(numbers, PX, i, (p[0] if stays else end[0], p[1] if stays else end[1], p[2] if stays else end[2]))
-        numbers[at(FREE, i)] = free if stays else -1.0
-        numbers[at(BOUND, i)] = bound if stays else (there if once else left)
+        put(numbers, PX, i, (p[0] if ends else end[0], p[1] if ends else end[1], p[2] if ends else end[2]))
+        numbers[at(WAY, i)] = free if walks and not ends else 0.0
+        numbers[at(FREE, i)] = free if ends else -1.0
+        numbers[at(BOUND, i)] = bound if ends else (there if words[at(ONCE, i)] != np.uint64(0) else left)
+        numbers[at(WAITS, i)] -= 1.0
+    travel = media.travel[0]
+    if travel < 0:
+        return
+    least = world.absorption.least[travel]
+    for i in range(first, last):
+        way = numbers[at(WAY, i)]
+        if words[at(STATE, i)] == np.uint64(LIGHT) and numbers[at(FREE, i)] >= 0.0:  # it flew out
+            d = three(numbers, DX, i)
+            t, along, _ = way_out(low, high, three(numbers, PX, i), d, d)
+            way = t - HAIR * g.slack[0] * min(1.0 / abs(along), GRAZING)
+        lanes.amounts[i, travel] += way
+        numbers[at(LUCK, i)] += least * way
+
+
+@njit(**KERNEL)
+def choose(media, lanes):
+    """Choose the component of the grain that each lane has come to."""
+    numbers, words, last = lanes.numbers, lanes.words, media.kinds[0] - 1
+    for i in range(lanes.counts[LIVE]):
+        c = 0
+        if last > 0:
+            words[at(KEY, i)] += GOLDEN
+            u = unit(mix(words[at(KEY, i)]))
+            while c < last and u >= media.choice[c]:
+                c += 1
+        words[at(KIND, i)] = np.uint64(c)
 
 
 @njit(**KERNEL)
 def deflect(world, lanes):
     """Let the grain that each lane has come to deflect its light."""
     numbers, words, media = lanes.numbers, lanes.words, world.media
-    last = media.kinds[0] - 1
     for i in range(lanes.counts[LIVE]):
-        key, c = words[at(KEY, i)], 0
-        if last > 0:
-            key += GOLDEN
-            u = unit(mix(key))
-            while c < last and u >= media.choice[c]:
-                c += 1
-        key += GOLDEN
+        key, c = words[at(KEY, i)] + GOLDEN, np.int64(words[at(KIND, i)])
         u0, u1 = halves(mix(key))
         cosine, pdf, r, z, phi, length, key = deflection(world, c, u0, key)
         words[at(KEY, i)] = key
         numbers[at(COSINE, i)], numbers[at(TURN, i)], numbers[at(PDF, i)] = cosine, u1, pdf
         numbers[at(R, i)], numbers[at(Z, i)], numbers[at(PHI, i)] = r, z, phi
-        numbers[at(SCALE, i)] = media.scale[c]
+        numbers[at(LENGTH, i)] = media.scale[c] * length
+
+
+@njit(forceinline=True, **KERNEL)
+def landing(low, high, slack, p, offset, size, bound, d):
+    """Return whether a jump of that size from p, around which `bound` is free, ends inside, whether it goes out, where
+    it ends, how much is free around it if it ends inside, and what part of it is beyond the boundary; light goes on
+    along d. See `transport.land`."""
+    there = bound - size
+    near = there > 0.0 or size == 0.0
+    each = 1.0 / math.sqrt(dot(offset, offset))
+    e = (offset[0] * each, offset[1] * each, offset[2] * each)
+    beyond = depth(low, high, step(p, size, e)) - HAIR * slack
+    sure = near or beyond > 0.0
+    t, along, outward = way_out(low, high, p, e, d)
+    leaves = t < size and not sure
+    out = leaves and outward > 0.0
+    move = slack * min(1.0 / abs(along), GRAZING)
+    goes = t + (move if out else -min(move, 0.5 * t)) if leaves else size
+    q, end = step(p, 1.0, offset), step(p, goes, e)
+    end = (q[0] if near else end[0], q[1] if near else end[1], q[2] if near else end[2])
+    return sure, out, end, there if near else beyond, 1.0 - t / size if leaves else 0.0
 
 
 @njit(**KERNEL)
-def land(g, lanes):
+def land(world, lanes):
     """Turn the lanes' directions and let them jump to where they leave their grains, or to the boundary and, from
-    there, out or in again; see `transport.land`."""
-    numbers, words, hair, slack = lanes.numbers, lanes.words, HAIR * g.slack[0], g.slack[0]
+    there, out or in again."""
+    g, numbers, words, leaps = world.geometry, lanes.numbers, lanes.words, world.leaps
+    slack, scale = g.slack[0], world.media.scale[0]
     low, high = sides(g)
     for i in range(lanes.counts[LIVE]):
-        p, d, bound, scale = three(numbers, PX, i), three(numbers, DX, i), numbers[at(BOUND, i)], numbers[at(SCALE, i)]
-        once = words[at(ONCE, i)] != np.uint64(0)
+        p, d = three(numbers, PX, i), three(numbers, DX, i)
         d, offset = leave(
             d, numbers[at(COSINE, i)], numbers[at(TURN, i)], numbers[at(R, i)], numbers[at(Z, i)], numbers[at(PHI, i)]
         )
         d = renewed(d)
-        square = dot(offset, offset)
-        size = scale * math.sqrt(square)
-        there = bound - size
-        near = there > 0.0 or size == 0.0
-        each = 1.0 / math.sqrt(square)
-        e = (offset[0] * each, offset[1] * each, offset[2] * each)
-        beyond = depth(low, high, step(p, size, e)) - hair
-        sure = near or beyond > 0.0
-        t, cosine, outward = way_out(low, high, p, e, d)
-        leaves = t < size and not sure
-        out = leaves and outward > 0.0
-        move = slack * min(1.0 / abs(cosine), GRAZING)
-        goes = t + (move if out else -min(move, 0.5 * t)) if leaves else size
-        q, end = step(p, scale, offset), step(p, goes, e)
-        p = (q[0] if near else end[0], q[1] if near else end[1], q[2] if near else end[2])
+        size, offset = scale * math.sqrt(dot(offset, offset)), (scale * offset[0], scale * offset[1], scale * offset[2])
+        sure, out, p, left, back = landing(low, high, slack, p, offset, size, numbers[at(BOUND, i)], d)
+        anew = not sure or words[at(ONCE, i)] != np.uint64(0)  # `transport.wander` would begin again
         put(numbers, PX, i, p)
         put(numbers, DX, i, d)
-        kept = sure and not once
-        numbers[at(BOUND, i)] = (there if near else beyond) if kept else depth(low, high, p)
+        numbers[at(BOUND, i)] = depth(low, high, p) if anew else left
+        numbers[at(BACK, i)] = back
+        numbers[at(WAITS, i)] = -1.0 if anew else numbers[at(WAITS, i)]
         words[at(MET, i)] += np.uint64(1)
-        words[at(ONCE, i)] = np.uint64(leaves)
+        words[at(ONCE, i)] = np.uint64(back > 0.0)
         words[at(STATE, i)] = np.uint64(LIGHT) if out else np.uint64(WALKS)
+    for i in range(lanes.counts[LIVE]):
+        if numbers[at(WAITS, i)] < 0.0:
+            numbers[at(WAITS, i)] = wait(leaps, words[at(ONCE, i)], numbers[at(BOUND, i)])
+
+
+@njit(**KERNEL)
+def absorb(world, batch, lanes):
+    """Count the matter that light has crossed in grains, and play roulette with what is dim."""
+    numbers, words, media = lanes.numbers, lanes.words, world.media
+    for i in range(lanes.counts[LIVE]):
+        slot = media.slot[np.int64(words[at(KIND, i)])]
+        if slot < 0:
+            continue
+        least, length, back = world.absorption.least[slot], numbers[at(LENGTH, i)], numbers[at(BACK, i)]
+        lanes.amounts[i, slot] += length
+        luck = numbers[at(LUCK, i)] + least * length
+        numbers[at(LUCK, i)] = luck
+        if back > 0.0:
+            lanes.amounts[i, slot] -= back * length
+            numbers[at(LUCK, i)] = luck - least * (back * length)
+    for i in range(lanes.counts[LIVE]):
+        if numbers[at(LUCK, i)] < DIM and words[at(ONCE, i)] == np.uint64(0) and words[at(STATE, i)] == np.uint64(WALKS):
+            words[at(KEY, i)] += GOLDEN
+            w = note(batch, lanes, i)
+            if not lives(w, w.key):
+                words[at(STATE, i)] = np.uint64(DEAD)
+            numbers[at(LUCK, i)], numbers[at(WEIGHT, i)] = w.luck, w.weight
+
+
+@njit(**KERNEL)
+def soar(world, batch, lanes):
+    """Let lanes leap that have come deep enough, see `leaps`; return whether any of them walks no more."""
+    numbers, words, gone = lanes.numbers, lanes.words, False
+    for i in range(lanes.counts[LIVE]):
+        while words[at(STATE, i)] == np.uint64(WALKS) and numbers[at(WAITS, i)] <= 0.0:
+            w = note(batch, lanes, i)
+            later, bound = leap(world, batch, w, lanes.amounts[i])
+            numbers[at(WAITS, i)] = float(later)
+            if later > LEAPT_ON:
+                break
+            if later == ENDS:
+                words[at(STATE, i)] = np.uint64(DEAD)
+                break
+            put(numbers, PX, i, triple(w.p))
+            put(numbers, DX, i, triple(w.d))
+            words[at(KEY, i)], words[at(MET, i)] = w.key, np.uint64(w.events)
+            numbers[at(FREE, i)], numbers[at(LUCK, i)], numbers[at(PDF, i)] = w.free, w.luck, w.pdf
+            numbers[at(WEIGHT, i)], numbers[at(BOUND, i)] = w.weight, bound
+            fly(world, lanes, i, i + 1)
+        gone |= words[at(STATE, i)] != np.uint64(WALKS)
+    return gone
+
+
+# ------------------------------------------------------------------------------------------- light that is aimed
+
+
+@njit(**KERNEL)
+def connect(world, batch, lanes):
+    """Let light arrive from a light and be deflected into each lane's path by its grain; see `transport.connect`."""
+    g, media, numbers, words = world.geometry, world.media, lanes.numbers, lanes.words
+    mean, reach, slack = media.free[0], media.reach[0], g.slack[0]
+    low, high = sides(g)
+    for i in range(lanes.counts[LIVE]):
+        bound = numbers[at(BOUND, i)]
+        if bound < 8.0 * mean:
+            bound = max(bound, depth(low, high, three(numbers, PX, i)))
+            numbers[at(BOUND, i)] = bound
+        share = math.exp((reach - bound) / mean) if reach < bound else 1.0
+        key = words[at(KEY, i)] + GOLDEN
+        words[at(KEY, i)] = key
+        weight = 0.0
+        if unit(mix(key)) < share:
+            c = np.int64(words[at(KIND, i)])
+            toward, light, weight, cosine, r, z, phi, length, key = aimed(
+                world, three(numbers, DX, i), c, mix(key ^ OTHER)
+            )
+            put(numbers, TX, i, toward)
+            numbers[at(COSINE, i)], numbers[at(R, i)], numbers[at(Z, i)], numbers[at(PHI, i)] = cosine, r, z, phi
+            numbers[at(LENGTH, i)], words[at(OTHER_KEY, i)] = media.scale[c] * length, key
+            weight *= numbers[at(WEIGHT, i)] / share
+            put(numbers, RED, i, (light[0] * weight, light[1] * weight, light[2] * weight))
+        words[at(AIMED, i)] = np.uint64(weight > 0.0)
+    shade(g, media, lanes)
+    for i in range(lanes.counts[LIVE]):
+        if words[at(AIMED, i)] == np.uint64(0):
+            continue
+        passed, way = numbers[at(COSINE, i)], numbers[at(WAY, i)]
+        if passed < FAINT:
+            if unit(mix(words[at(OTHER_KEY, i)] + GOLDEN)) * FAINT >= passed:
+                continue
+            passed = FAINT
+        amounts, slot = lanes.amounts[i], media.slot[np.int64(words[at(KIND, i)])]
+        if amounts.shape[0] > 0:
+            copy(lanes.amounts[2 * WIDTH], amounts)
+            amounts = lanes.amounts[2 * WIDTH]
+            if slot >= 0:
+                amounts[slot] += numbers[at(LENGTH, i)] * (1.0 - numbers[at(BACK, i)])
+            if media.travel[0] >= 0:
+                amounts[media.travel[0]] += way
+        left, sample = absorbed(world.absorption, amounts, batch.spectrum), words[at(SAMPLE, i)]
+        for k in range(3):
+            batch.radiance[sample, k] += passed * numbers[at(RED + k, i)] * left[k]
+
+
+@njit(**KERNEL)
+def shade(g, media, lanes):
+    """Take light that is aimed from where it leaves its grain out of the medium: as COSINE what comes through, as WAY
+    what it has flown, as BACK what part of the jump is beyond the boundary; see `transport.fly`."""
+    numbers, scale, slack, mean = lanes.numbers, media.scale[0], g.slack[0], media.free[0]
+    low, high = sides(g)
+    for i in range(lanes.counts[LIVE]):
+        p, d, toward = three(numbers, PX, i), three(numbers, DX, i), three(numbers, TX, i)
+        offset = carried(
+            d, toward, numbers[at(COSINE, i)], numbers[at(R, i)], numbers[at(Z, i)], numbers[at(PHI, i)], scale
+        )
+        size = math.sqrt(dot(offset, offset))
+        _, out, p, _, back = landing(low, high, slack, p, offset, size, numbers[at(BOUND, i)], toward)
+        t, along, _ = way_out(low, high, p, toward, toward)
+        way = 0.0 if out else t - HAIR * slack * min(1.0 / abs(along), GRAZING)
+        numbers[at(WAY, i)], numbers[at(BACK, i)] = way, back
+        numbers[at(COSINE, i)] = power(-way / mean)
 
 
 # ------------------------------------------------------------------------------------------- coming and going
 
 
 @njit(**KERNEL)
-def settle(world, batch, lanes, i):
-    """Let a lane that walks no more find its light, or hand its walker over."""
-    numbers, words = lanes.numbers, lanes.words
-    d, sample, amounts = three(numbers, DX, i), np.int64(words[at(SAMPLE, i)]), lanes.amounts[i]
-    if words[at(STATE, i)] == np.uint64(LIGHT):
-        light = light_from(world.lights, d, numbers[at(PDF, i)])
-        left = absorbed(world.absorption, amounts, batch.spectrum)
-        for k in range(3):
-            batch.radiance[sample, k] += numbers[at(WEIGHT, i)] * light[k] * left[k]
-        return
-    w = batch.walkers[lanes.counts[HANDED]]
-    copy(batch.amounts[lanes.counts[HANDED]], amounts)
-    lanes.counts[HANDED] += 1
+def note(batch, lanes, i):
+    """Return the walker of a lane as `transport` knows it, written where the next is handed over."""
+    numbers, words, w = lanes.numbers, lanes.words, batch.walkers[lanes.counts[HANDED]]
     write(w.p, three(numbers, PX, i))
-    write(w.d, d)
+    write(w.d, three(numbers, DX, i))
     for k in range(3):
         w.colour[k] = 1.0
     w.weight, w.luck, w.pdf = numbers[at(WEIGHT, i)], numbers[at(LUCK, i)], numbers[at(PDF, i)]
     w.free, w.skip, w.key, w.events = numbers[at(FREE, i)], 0.0, words[at(KEY, i)], np.int64(words[at(MET, i)])
-    w.sample, w.ray, w.medium, w.mode = sample, NONE, 0, FLY
+    w.sample, w.ray, w.medium, w.mode = np.int64(words[at(SAMPLE, i)]), NONE, 0, FLY
     w.tries, w.shadow, w.single, w.left = 0, 0, 0, 0
+    return w
+
+
+@njit(**KERNEL)
+def settle(world, batch, lanes, i):
+    """Let a lane that walks no more find its light, or hand its walker over."""
+    numbers, state, amounts = lanes.numbers, lanes.words[at(STATE, i)], lanes.amounts[i]
+    if state == np.uint64(LIGHT):
+        light = light_from(world.lights, three(numbers, DX, i), numbers[at(PDF, i)])
+        left, sample = absorbed(world.absorption, amounts, batch.spectrum), lanes.words[at(SAMPLE, i)]
+        for k in range(3):
+            batch.radiance[sample, k] += numbers[at(WEIGHT, i)] * light[k] * left[k]
+    elif state == np.uint64(LOST):
+        note(batch, lanes, i)
+        copy(batch.amounts[lanes.counts[HANDED]], amounts)
+        lanes.counts[HANDED] += 1
 
 
 @njit(**KERNEL)
@@ -356,7 +536,7 @@ def move(lanes, i, j):
     """Write the walker of lane i to lane j."""
     for field in range(KEPT):
         lanes.numbers[at(field, j)] = lanes.numbers[at(field, i)]
-    for field in range(WORDS):
+    for field in range(WORDS_KEPT):
         lanes.words[at(field, j)] = lanes.words[at(field, i)]
     copy(lanes.amounts[j], lanes.amounts[i])
 
@@ -366,8 +546,8 @@ def welcome(world, batch, lanes, job, count):
     """Make the next samples ready, so many, as far as they come to a grain."""
     begin(lanes, job, lanes.counts[NEXT], count)
     lanes.counts[NEXT] += count
-    arrive(world.geometry, lanes, count)
-    fly(world.geometry, world.media, lanes, WIDTH, WIDTH + count)
+    arrive(world.geometry, world.leaps, lanes, count)
+    fly(world, lanes, WIDTH, WIDTH + count)
     ready = 0
     for i in range(WIDTH, WIDTH + count):
         lanes.ready[ready] = i
@@ -412,13 +592,20 @@ def relieve(world, batch, lanes, job, total):
 def walk(world, batch, lanes, job, total):
     """Walk the samples of a job, `total` of them, until all have found light, or so many steps have been taken or so
     many walkers handed over that others must have their turn."""
-    counts = lanes.counts
+    counts, leaps = lanes.counts, world.leaps.size[0, ROOM] < math.inf
     counts[HANDED] = 0
     for _ in range(STEPS):
-        fly(world.geometry, world.media, lanes, 0, counts[LIVE])
+        fly(world, lanes, 0, counts[LIVE])
         relieve(world, batch, lanes, job, total)
+        while leaps and soar(world, batch, lanes):
+            relieve(world, batch, lanes, job, total)
         if counts[LIVE] == 0 or 4 * counts[HANDED] > batch.walkers.shape[0]:
             break
+        choose(world.media, lanes)
+        if world.lights.sampled:
+            connect(world, batch, lanes)
         deflect(world, lanes)
-        land(world.geometry, lanes)
+        land(world, lanes)
+        if lanes.amounts.shape[1] > 0:
+            absorb(world, batch, lanes)
         batch.counters[EVENTS] += counts[LIVE]

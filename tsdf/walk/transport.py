@@ -163,54 +163,76 @@ def offset_of(media, tables, c, column, key):
 
 
 @njit(forceinline=True, **KERNEL)
+def aimed(world, d, c, key):
+    """Draw light that arrives from a light and is deflected by a grain of component c into the path of a walker that
+    goes along d; `key` is for this.
+
+    Returns the direction toward the light, its radiance and weight, 0 where there is nothing to draw; the cosine of
+    the deflection, r, z and phi_Delta, the path length [R], 1 where there are none; and the key that is used up.
+    """
+    media, tables = world.media, world.tables
+    u0, u1 = halves(key)
+    key += GOLDEN
+    bits = mix(key)
+    toward, light_pdf, light = draw_light(world.lights, u0, u1, unit(bits))
+    cosine, column, phase = dot(d, toward), 0, 0.0
+    r, z, phi, length = 0.0, 0.0, 0.0, 1.0
+    if light_pdf > 0.0:
+        if media.traits.tabulated:
+            column = column_of(tables, c, min(max(cosine, -1.0), 1.0))
+            phase = density(tables, column)
+        elif media.traits.lobe:
+            phase = lobe_density(media.g[c], cosine)
+        else:
+            phase = 0.25 / math.pi
+    if not phase > 0.0:
+        return toward, light, 0.0, cosine, r, z, phi, length, key
+    key += GOLDEN
+    if media.traits.jumps:
+        r, z, phi, length = offset_of(media, tables, c, column, key)
+        key += GOLDEN
+    elif media.traits.tabulated and media.slot[c] >= 0:
+        length = draw_length(tables, column, unit(mix(key)))
+    return toward, light, phase / (light_pdf + phase), cosine, r, z, phi, length, key
+
+
+@njit(forceinline=True, **KERNEL)
+def carried(d, toward, cosine, r, z, phi, scale):
+    """Return the offset of light that is deflected by a grain of radius `scale` from d to the direction toward a light,
+    whose cosine that is."""
+    side = step(toward, -cosine, d)
+    size = math.sqrt(dot(side, side))
+    first, _ = frame(d)
+    straight = not size > 1e-12
+    side = (
+        first[0] if straight else side[0] / size,
+        first[1] if straight else side[1] / size,
+        first[2] if straight else side[2] / size,
+    )
+    co, si = turned(phi * (0.5 / math.pi) - math.floor(phi * (0.5 / math.pi)))
+    along, aside, up = z * scale, r * co * scale, r * si * scale
+    return step(step((along * d[0], along * d[1], along * d[2]), aside, side), up, cross(d, side))
+
+
+@njit(forceinline=True, **KERNEL)
 def connect(world, batch, w, amounts, p, c, share, bound):
     """Send off light that arrives from a light and is deflected into the walker's path by a grain.
 
     The grain, of component c of the walker's medium, is entered at p by the walker; its key is for this. `share` is
     the probability that this is done at all; nothing is nearer than `bound`.
     """
-    media, tables, d = world.media, world.tables, triple(w.d)
-    key = mix(w.key ^ OTHER)
-    u0, u1 = halves(key)
-    key += GOLDEN
-    bits = mix(key)
-    toward, light_pdf, light = draw_light(world.lights, u0, u1, unit(bits))
-    if not light_pdf > 0.0:
-        return
-    cosine = dot(d, toward)
-    column = 0
-    if media.traits.tabulated:
-        column = column_of(tables, c, min(max(cosine, -1.0), 1.0))
-        phase = density(tables, column)
-    elif media.traits.lobe:
-        phase = lobe_density(media.g[c], cosine)
-    else:
-        phase = 0.25 / math.pi
-    if not phase > 0.0:
+    media, d = world.media, triple(w.d)
+    toward, light, weight, cosine, r, z, phi, length, key = aimed(world, d, c, mix(w.key ^ OTHER))
+    if not weight > 0.0:
         return
     number = born(batch, amounts)
     shadow, its_amounts = batch.out[number], batch.out_amounts[number]
-    amount, offset = 1.0, (0.0, 0.0, 0.0)
-    key += GOLDEN
+    amount, offset = media.scale[c] * length, (0.0, 0.0, 0.0)
     if media.traits.jumps:
-        r, z, phi, length = offset_of(media, tables, c, column, key)
-        key += GOLDEN
-        side = step(toward, -cosine, d)
-        size = math.sqrt(dot(side, side))
-        if size > 1e-12:
-            side = (side[0] / size, side[1] / size, side[2] / size)
-        else:
-            side = frame(d)[0]
-        co, si = turned(phi * (0.5 / math.pi) - math.floor(phi * (0.5 / math.pi)))
-        scale = media.scale[c]
-        amount = scale * length
-        along, aside, up = z * scale, r * co * scale, r * si * scale
-        offset = step(step((along * d[0], along * d[1], along * d[2]), aside, side), up, cross(d, side))
-    elif media.traits.tabulated:
-        amount = media.scale[c] * draw_length(tables, column, unit(mix(key))) if media.slot[c] >= 0 else 0.0
+        offset = carried(d, toward, cosine, r, z, phi, media.scale[c])
     if media.slot[c] >= 0:
         its_amounts[media.slot[c]] += amount
-    cast(w, shadow, p, toward, light, phase / (light_pdf + phase) / share, w.medium, key)
+    cast(w, shadow, p, toward, light, weight / share, w.medium, key)
     size = math.sqrt(dot(offset, offset))
     if size > 0.0:
         if size < bound:
