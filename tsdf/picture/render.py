@@ -23,7 +23,7 @@ from tsdf.handle import Handle
 from tsdf.picture.trust import SHOWN, Moments, Trust, kurtosis_of
 from tsdf.picture.world import World, camera_of, sees
 from tsdf.scene.levels import LEVELS
-from tsdf.walk import packed, transport
+from tsdf.walk import lanes, packed, transport
 from tsdf.walk import walker as W
 from tsdf.walk.hybrid import ALL
 from tsdf.walk.transport import CameraArrays
@@ -129,6 +129,10 @@ class Walkers:
         self.asked = np.zeros(W.GRAINS_ASKED + exemplars, np.int64)
         self.spectrum = np.zeros(world.absorption.spectral.shape[1])
         self.radiance = np.zeros((0, 3))
+        self.lanes = self.abreast = None
+        if lanes.suited(world.place.arrays, world.media):
+            self.lanes = lanes.lanes_of(world.amounts)
+            self.abreast = Handle(self.lanes)
         self.reserve(1)
 
     def reserve(self, samples: int) -> None:
@@ -161,6 +165,9 @@ class Walkers:
         total = pixels * job.spp
         self.reserve(total)
         first, live = 0, 0
+        if self.lanes is not None:
+            first = total
+            self.walk(job, total, stop)
         while (live or first < total) and not stop.is_set():
             if live <= SLOTS // 2 and first < total:
                 fresh = min(SLOTS - live, total - first)
@@ -168,6 +175,17 @@ class Walkers:
                 first, live = first + fresh, live + fresh
             live = self.turn(live)
         return self.radiance[:total].reshape(pixels, job.spp, 3).copy()
+
+    def walk(self, job: transport.Job, total: int, stop: threading.Event) -> None:
+        """Walk the samples of a job, `total` of them, in lanes."""
+        assert self.lanes is not None
+        counts = self.lanes.counts
+        counts[:] = 0
+        while (counts[lanes.LIVE] or counts[lanes.NEXT] < total) and not stop.is_set():
+            lanes.walk(self.arrays, self.batches[0], self.abreast, job, total)
+            live = int(counts[lanes.HANDED])
+            while live and not stop.is_set():
+                live = self.turn(live)
 
     def spawn(self, live: int, job: transport.Job, first: int, count: int) -> None:
         """Start walkers, behind the first `live` of ``walkers[0]``, for samples first .. first + count - 1 of a job."""

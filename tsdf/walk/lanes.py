@@ -15,19 +15,16 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from llvmlite import ir  # type: ignore[import-untyped]
-from numba import types
-from numba.extending import intrinsic
 
-from tsdf.compiled import njit
+from tsdf.compiled import bits_of, float_of, njit
 from tsdf.data.sampler import leave
 from tsdf.sampling import GOLDEN, key_of, mix, unit
 from tsdf.vectors import KERNEL, dot, renewed, step, triple
-from tsdf.walk.geometry import NONE
+from tsdf.walk.geometry import NONE, Geometry
 from tsdf.walk.grid import GRAZING
 from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, ROOM, leap, missing, patience
 from tsdf.walk.lights import radiance as light_from
-from tsdf.walk.room import SLAB
+from tsdf.walk.room import BOX, SLAB
 from tsdf.walk.transport import HAIR, aimed, carried, deflection
 from tsdf.walk.walker import (
     DIM,
@@ -36,6 +33,7 @@ from tsdf.walk.walker import (
     FLY,
     OTHER,
     PATIENCE,
+    Media,
     absorbed,
     copy,
     halves,
@@ -74,6 +72,12 @@ class Lanes(NamedTuple):
     counts: np.ndarray
 
 
+def suited(g: Geometry, media: Media) -> bool:
+    """Return whether nothing is in a scene but one medium in a box or slab, at a level that knows no packing."""
+    alone = len(g.kind) == 1 and g.kind[0] in (BOX, SLAB) and len(g.balls) == 0 and not g.engines
+    return alone and not media.traits.placed and not media.singles
+
+
 def lanes_of(amounts: int) -> Lanes:
     """Return lanes without walkers, for so many amounts."""
     return Lanes(
@@ -85,24 +89,12 @@ def lanes_of(amounts: int) -> Lanes:
 # ------------------------------------------------------------------------------------------- arithmetic
 
 
-@intrinsic
-def _bits(typing, x):
-    """Return the bits of a float64 as a whole number."""
-    return types.int64(types.float64), lambda c, builder, s, args: builder.bitcast(args[0], ir.IntType(64))
-
-
-@intrinsic
-def _float(typing, x):
-    """Return the float64 of these bits."""
-    return types.float64(types.int64), lambda c, builder, s, args: builder.bitcast(args[0], ir.DoubleType())
-
-
 @njit(forceinline=True, **KERNEL)
 def logarithm(x):
     """Return the natural logarithm of x > 0 to some ulps, by the series of the inverse hyperbolic tangent."""
-    bits = _bits(x)
+    bits = bits_of(x)
     exponent = (bits >> 52) - 1023
-    m = _float((bits & 0x000FFFFFFFFFFFFF) | 0x3FF0000000000000)
+    m = float_of((bits & 0x000FFFFFFFFFFFFF) | 0x3FF0000000000000)
     large = m > math.sqrt(2.0)
     m = 0.5 * m if large else m
     e = float(exponent) + (1.0 if large else 0.0)
@@ -305,7 +297,7 @@ def fly(world, lanes, first, last):
 @njit(**KERNEL)
 def choose(media, lanes):
     """Choose the component of the grain that each lane has come to."""
-    numbers, words, last = lanes.numbers, lanes.words, media.kinds[0] - 1
+    words, last = lanes.words, media.kinds[0] - 1
     for i in range(lanes.counts[LIVE]):
         c = 0
         if last > 0:
@@ -396,7 +388,11 @@ def absorb(world, batch, lanes):
             lanes.amounts[i, slot] -= back * length
             numbers[at(LUCK, i)] = luck - least * (back * length)
     for i in range(lanes.counts[LIVE]):
-        if numbers[at(LUCK, i)] < DIM and words[at(ONCE, i)] == np.uint64(0) and words[at(STATE, i)] == np.uint64(WALKS):
+        if (
+            numbers[at(LUCK, i)] < DIM
+            and words[at(ONCE, i)] == np.uint64(0)
+            and words[at(STATE, i)] == np.uint64(WALKS)
+        ):
             words[at(KEY, i)] += GOLDEN
             w = note(batch, lanes, i)
             if not lives(w, w.key):
@@ -435,7 +431,7 @@ def soar(world, batch, lanes):
 def connect(world, batch, lanes):
     """Let light arrive from a light and be deflected into each lane's path by its grain; see `transport.connect`."""
     g, media, numbers, words = world.geometry, world.media, lanes.numbers, lanes.words
-    mean, reach, slack = media.free[0], media.reach[0], g.slack[0]
+    mean, reach = media.free[0], media.reach[0]
     low, high = sides(g)
     for i in range(lanes.counts[LIVE]):
         bound = numbers[at(BOUND, i)]
