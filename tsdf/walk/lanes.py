@@ -25,7 +25,7 @@ from tsdf.walk.grid import GRAZING
 from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, ROOM, leap, missing, patience
 from tsdf.walk.lights import radiance as light_from
 from tsdf.walk.room import BOX, SLAB
-from tsdf.walk.transport import HAIR, aimed, carried, deflection
+from tsdf.walk.transport import HAIR, aimed, carried, deflected, words_of
 from tsdf.walk.walker import (
     DIM,
     EVENTS,
@@ -50,8 +50,8 @@ STEPS = 4096  # of all lanes together, before others have their turn
 PX, PY, PZ, DX, DY, DZ, PDF, FREE, BOUND, LUCK, WEIGHT, WAITS = range(12)
 WAY, COSINE, TURN, R, Z, PHI, LENGTH, BACK, TX, TY, TZ, RED, GREEN, BLUE = range(12, 26)
 KEPT, NUMBERS = 12, 26
-KEY, SAMPLE, MET, ONCE, STATE, KIND, AIMED, OTHER_KEY = range(8)  # words of a lane
-WORDS_KEPT, WORDS = 6, 8
+KEY, SAMPLE, MET, ONCE, STATE, KIND, AIMED, ONE, TWO, BITS, MORE = range(11)  # words of a lane
+WORDS_KEPT, WORDS = 6, 11
 WALKS, LIGHT, LOST, DEAD = range(4)  # STATE of a lane: it goes on, finds light, is handed over, or roulette ended it
 LIVE, NEXT, READY, HANDED = range(4)  # of `Lanes.counts`
 
@@ -144,7 +144,7 @@ def depth(low, high, p):
 
 @njit(forceinline=True, **KERNEL)
 def between(low, high, at, d):
-    """Return where a ray is between two planes, as `geometry._between`."""
+    """Return where a ray is between two planes, as `geometry._between`, and 1 / d."""
     low, high = low - at, high - at
     begins = low < 0.0 < high
     each = 1.0 / d
@@ -153,35 +153,51 @@ def between(low, high, at, d):
     still = d == 0.0
     near = (-math.inf if begins else math.inf) if still else near
     far = (math.inf if begins else -math.inf) if still else far
-    return near, far
+    return near, far, each
 
 
 @njit(forceinline=True, **KERNEL)
 def way_in(low, high, p, d):
-    """Return where a ray from outside comes in, infinite if nowhere, and the part of d across the side where it does;
-    as `geometry.exact_hit`."""
-    near, far = between(low[2], high[2], p[2], d[2])
-    a, b = between(low[1], high[1], p[1], d[1])
-    along = d[1] if a >= near else d[2]
+    """Return where a ray from outside comes in, infinite if nowhere, and 1 over the part of d across the side where it
+    does; as `geometry.exact_hit`."""
+    near, far, each = between(low[2], high[2], p[2], d[2])
+    a, b, across = between(low[1], high[1], p[1], d[1])
+    each = across if a >= near else each
     near, far = a if a >= near else near, b if b <= far else far
-    a, b = between(low[0], high[0], p[0], d[0])
-    along = d[0] if a >= near else along
+    a, b, across = between(low[0], high[0], p[0], d[0])
+    each = across if a >= near else each
     near, far = a if a >= near else near, b if b <= far else far
-    return near if 0.0 <= near <= far else math.inf, along
+    return near if 0.0 <= near <= far else math.inf, each
 
 
 @njit(forceinline=True, **KERNEL)
 def way_out(low, high, p, e, d):
-    """Return where a ray from inside along e goes out, the part of e across the side where it does, and how far d
-    points outward there; as `geometry.exact_hit`."""
-    _, t = between(low[2], high[2], p[2], e[2])
-    _, b = between(low[1], high[1], p[1], e[1])
-    along, outward = e[1] if b <= t else e[2], d[1] if b <= t else d[2]
-    t = b if b <= t else t
-    _, b = between(low[0], high[0], p[0], e[0])
-    along, outward = e[0] if b <= t else along, d[0] if b <= t else outward
-    t = b if b <= t else t
-    return t, along, outward if along > 0.0 else -outward
+    """Return where a ray from inside along e goes out, 1 over the part of e across the side where it does, and how far
+    d points outward there; as `geometry.exact_hit`, with one division."""
+    x = high[0] - p[0] if e[0] > 0.0 else p[0] - low[0]
+    y = high[1] - p[1] if e[1] > 0.0 else p[1] - low[1]
+    z = high[2] - p[2] if e[2] > 0.0 else p[2] - low[2]
+    size, along, outward = z, abs(e[2]), d[2] if e[2] > 0.0 else -d[2]
+    first = y * along <= size * abs(e[1])
+    size, along = y if first else size, abs(e[1]) if first else along
+    outward = (d[1] if e[1] > 0.0 else -d[1]) if first else outward
+    first = x * along <= size * abs(e[0])
+    size, along = x if first else size, abs(e[0]) if first else along
+    outward = (d[0] if e[0] > 0.0 else -d[0]) if first else outward
+    each = 1.0 / along
+    return size * each, each, outward
+
+
+@njit(forceinline=True, **KERNEL)
+def give(world, batch, sample, amounts, weight, light):
+    """Add light to a sample, less what the amounts of matter that it has crossed take; see `walker.find`."""
+    left = (1.0, 1.0, 1.0)
+    if amounts.shape[0] > 0:
+        left = absorbed(world.absorption, amounts, batch.spectrum)
+    radiance = batch.radiance
+    radiance[sample, 0] += weight * light[0] * left[0]
+    radiance[sample, 1] += weight * light[1] * left[1]
+    radiance[sample, 2] += weight * light[2] * left[2]
 
 
 # ------------------------------------------------------------------------------------------- from the camera
@@ -227,9 +243,9 @@ def arrive(g, leaps, lanes, count):
     low, high = sides(g)
     for i in range(WIDTH, WIDTH + count):
         p, d = three(numbers, PX, i), three(numbers, DX, i)
-        near, along = way_in(low, high, p, d)
+        near, each = way_in(low, high, p, d)
         inside, met = depth(low, high, p) > 0.0, near < math.inf
-        move = 0.0 if inside else (near + slack * min(1.0 / abs(along), GRAZING) if met else 0.0)
+        move = 0.0 if inside else (near + slack * min(abs(each), GRAZING) if met else 0.0)
         p = step(p, move, d)
         put(numbers, PX, i, p)
         numbers[at(PDF, i)], numbers[at(FREE, i)], numbers[at(BOUND, i)] = -1.0, -1.0, depth(low, high, p)
@@ -288,8 +304,8 @@ def fly(world, lanes, first, last):
         way = numbers[at(WAY, i)]
         if words[at(STATE, i)] == np.uint64(LIGHT) and numbers[at(FREE, i)] >= 0.0:  # it flew out
             d = three(numbers, DX, i)
-            t, along, _ = way_out(low, high, three(numbers, PX, i), d, d)
-            way = t - HAIR * g.slack[0] * min(1.0 / abs(along), GRAZING)
+            t, each, _ = way_out(low, high, three(numbers, PX, i), d, d)
+            way = t - HAIR * g.slack[0] * min(each, GRAZING)
         lanes.amounts[i, travel] += way
         numbers[at(LUCK, i)] += least * way
 
@@ -312,35 +328,43 @@ def choose(media, lanes):
 def deflect(world, lanes):
     """Let the grain that each lane has come to deflect its light."""
     numbers, words, media = lanes.numbers, lanes.words, world.media
+    used = words_of(media.traits) * GOLDEN
     for i in range(lanes.counts[LIVE]):
-        key, c = words[at(KEY, i)] + GOLDEN, np.int64(words[at(KIND, i)])
-        u0, u1 = halves(mix(key))
-        cosine, pdf, r, z, phi, length, key = deflection(world, c, u0, key)
-        words[at(KEY, i)] = key
-        numbers[at(COSINE, i)], numbers[at(TURN, i)], numbers[at(PDF, i)] = cosine, u1, pdf
+        key = words[at(KEY, i)] + GOLDEN
+        numbers[at(COSINE, i)], numbers[at(TURN, i)] = halves(mix(key))
+        words[at(BITS, i)], words[at(MORE, i)] = mix(key + GOLDEN), mix(key + GOLDEN + GOLDEN)
+        words[at(KEY, i)] = key + used
+    for i in range(lanes.counts[LIVE]):
+        c = np.int64(words[at(KIND, i)])
+        cosine, pdf, r, z, phi, length = deflected(
+            world, c, numbers[at(COSINE, i)], words[at(BITS, i)], words[at(MORE, i)]
+        )
+        numbers[at(COSINE, i)], numbers[at(PDF, i)] = cosine, pdf
         numbers[at(R, i)], numbers[at(Z, i)], numbers[at(PHI, i)] = r, z, phi
         numbers[at(LENGTH, i)] = media.scale[c] * length
 
 
 @njit(forceinline=True, **KERNEL)
-def landing(low, high, slack, p, offset, size, bound, d):
-    """Return whether a jump of that size from p, around which `bound` is free, ends inside, whether it goes out, where
+def landing(low, high, slack, p, offset, bound, d):
+    """Return whether a jump along an offset from p, around which `bound` is free, ends inside, whether it goes out, where
     it ends, how much is free around it if it ends inside, and what part of it is beyond the boundary; light goes on
     along d. See `transport.land`."""
+    square = dot(offset, offset)
+    part = 1.0 / math.sqrt(square)
+    size = square * part if square > 0.0 else 0.0
     there = bound - size
     near = there > 0.0 or size == 0.0
-    each = 1.0 / math.sqrt(dot(offset, offset))
-    e = (offset[0] * each, offset[1] * each, offset[2] * each)
+    e = (offset[0] * part, offset[1] * part, offset[2] * part)
     beyond = depth(low, high, step(p, size, e)) - HAIR * slack
     sure = near or beyond > 0.0
-    t, along, outward = way_out(low, high, p, e, d)
+    t, each, outward = way_out(low, high, p, e, d)
     leaves = t < size and not sure
     out = leaves and outward > 0.0
-    move = slack * min(1.0 / abs(along), GRAZING)
+    move = slack * min(each, GRAZING)
     goes = t + (move if out else -min(move, 0.5 * t)) if leaves else size
     q, end = step(p, 1.0, offset), step(p, goes, e)
     end = (q[0] if near else end[0], q[1] if near else end[1], q[2] if near else end[2])
-    return sure, out, end, there if near else beyond, 1.0 - t / size if leaves else 0.0
+    return sure, out, end, there if near else beyond, 1.0 - t * part if leaves else 0.0
 
 
 @njit(**KERNEL)
@@ -356,8 +380,8 @@ def land(world, lanes):
             d, numbers[at(COSINE, i)], numbers[at(TURN, i)], numbers[at(R, i)], numbers[at(Z, i)], numbers[at(PHI, i)]
         )
         d = renewed(d)
-        size, offset = scale * math.sqrt(dot(offset, offset)), (scale * offset[0], scale * offset[1], scale * offset[2])
-        sure, out, p, left, back = landing(low, high, slack, p, offset, size, numbers[at(BOUND, i)], d)
+        offset = (scale * offset[0], scale * offset[1], scale * offset[2])
+        sure, out, p, left, back = landing(low, high, slack, p, offset, numbers[at(BOUND, i)], d)
         anew = not sure or words[at(ONCE, i)] != np.uint64(0)  # `transport.wander` would begin again
         put(numbers, PX, i, p)
         put(numbers, DX, i, d)
@@ -435,21 +459,25 @@ def connect(world, batch, lanes):
     low, high = sides(g)
     for i in range(lanes.counts[LIVE]):
         bound = numbers[at(BOUND, i)]
-        if bound < 8.0 * mean:
-            bound = max(bound, depth(low, high, three(numbers, PX, i)))
-            numbers[at(BOUND, i)] = bound
-        share = math.exp((reach - bound) / mean) if reach < bound else 1.0
+        around = max(bound, depth(low, high, three(numbers, PX, i)))
+        numbers[at(BOUND, i)] = around if bound < 8.0 * mean else bound
         key = words[at(KEY, i)] + GOLDEN
         words[at(KEY, i)] = key
-        weight = 0.0
-        if unit(mix(key)) < share:
-            c = np.int64(words[at(KIND, i)])
-            toward, light, weight, cosine, r, z, phi, length, key = aimed(
-                world, three(numbers, DX, i), c, mix(key ^ OTHER)
-            )
+        numbers[at(COSINE, i)] = unit(mix(key))
+        key = mix(key ^ OTHER)
+        words[at(ONE, i)], words[at(TWO, i)] = key, mix(key + GOLDEN)
+        words[at(BITS, i)], words[at(MORE, i)] = mix(key + GOLDEN + GOLDEN), mix(key + GOLDEN + GOLDEN + GOLDEN)
+    for i in range(lanes.counts[LIVE]):
+        c, bound, weight = np.int64(words[at(KIND, i)]), numbers[at(BOUND, i)], 0.0
+        share = math.exp((reach - bound) / mean) if reach < bound else 1.0
+        if numbers[at(COSINE, i)] < share:
+            toward, light, weight, cosine, r, z, phi, length = aimed(
+                world, three(numbers, DX, i), c, words[at(ONE, i)], words[at(TWO, i)], words[at(BITS, i)],
+                words[at(MORE, i)],
+            )  # fmt: skip
             put(numbers, TX, i, toward)
             numbers[at(COSINE, i)], numbers[at(R, i)], numbers[at(Z, i)], numbers[at(PHI, i)] = cosine, r, z, phi
-            numbers[at(LENGTH, i)], words[at(OTHER_KEY, i)] = media.scale[c] * length, key
+            numbers[at(LENGTH, i)] = media.scale[c] * length
             weight *= numbers[at(WEIGHT, i)] / share
             put(numbers, RED, i, (light[0] * weight, light[1] * weight, light[2] * weight))
         words[at(AIMED, i)] = np.uint64(weight > 0.0)
@@ -459,7 +487,8 @@ def connect(world, batch, lanes):
             continue
         passed, way = numbers[at(COSINE, i)], numbers[at(WAY, i)]
         if passed < FAINT:
-            if unit(mix(words[at(OTHER_KEY, i)] + GOLDEN)) * FAINT >= passed:
+            key = words[at(ONE, i)] + (np.uint64(3) + np.uint64(media.traits.jumps)) * GOLDEN
+            if unit(mix(key)) * FAINT >= passed:
                 continue
             passed = FAINT
         amounts, slot = lanes.amounts[i], media.slot[np.int64(words[at(KIND, i)])]
@@ -470,9 +499,7 @@ def connect(world, batch, lanes):
                 amounts[slot] += numbers[at(LENGTH, i)] * (1.0 - numbers[at(BACK, i)])
             if media.travel[0] >= 0:
                 amounts[media.travel[0]] += way
-        left, sample = absorbed(world.absorption, amounts, batch.spectrum), words[at(SAMPLE, i)]
-        for k in range(3):
-            batch.radiance[sample, k] += passed * numbers[at(RED + k, i)] * left[k]
+        give(world, batch, words[at(SAMPLE, i)], amounts, passed, three(numbers, RED, i))
 
 
 @njit(**KERNEL)
@@ -486,10 +513,9 @@ def shade(g, media, lanes):
         offset = carried(
             d, toward, numbers[at(COSINE, i)], numbers[at(R, i)], numbers[at(Z, i)], numbers[at(PHI, i)], scale
         )
-        size = math.sqrt(dot(offset, offset))
-        _, out, p, _, back = landing(low, high, slack, p, offset, size, numbers[at(BOUND, i)], toward)
-        t, along, _ = way_out(low, high, p, toward, toward)
-        way = 0.0 if out else t - HAIR * slack * min(1.0 / abs(along), GRAZING)
+        _, out, p, _, back = landing(low, high, slack, p, offset, numbers[at(BOUND, i)], toward)
+        t, each, _ = way_out(low, high, p, toward, toward)
+        way = 0.0 if out else t - HAIR * slack * min(each, GRAZING)
         numbers[at(WAY, i)], numbers[at(BACK, i)] = way, back
         numbers[at(COSINE, i)] = power(-way / mean)
 
@@ -518,9 +544,7 @@ def settle(world, batch, lanes, i):
     numbers, state, amounts = lanes.numbers, lanes.words[at(STATE, i)], lanes.amounts[i]
     if state == np.uint64(LIGHT):
         light = light_from(world.lights, three(numbers, DX, i), numbers[at(PDF, i)])
-        left, sample = absorbed(world.absorption, amounts, batch.spectrum), lanes.words[at(SAMPLE, i)]
-        for k in range(3):
-            batch.radiance[sample, k] += numbers[at(WEIGHT, i)] * light[k] * left[k]
+        give(world, batch, lanes.words[at(SAMPLE, i)], amounts, numbers[at(WEIGHT, i)], light)
     elif state == np.uint64(LOST):
         note(batch, lanes, i)
         copy(batch.amounts[lanes.counts[HANDED]], amounts)

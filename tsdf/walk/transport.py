@@ -148,13 +148,12 @@ def bent(d, cosine, u):
 
 
 @njit(forceinline=True, **KERNEL)
-def offset_of(media, tables, c, column, key):
-    """Draw r, z, phi_Delta and the path length [R] given the deflection, from the word of `key` and the next."""
-    bits = mix(key)
+def offset_of(media, tables, c, column, bits, more):
+    """Return r, z, phi_Delta and the path length [R] that two words stand for, given the deflection."""
     if media.traits.joint:
         return draw_record(tables, column, unit(bits))
     u2, u3 = halves(bits)
-    u4, u5 = halves(mix(key + GOLDEN))
+    u4, u5 = halves(more)
     r, z, phi = draw_offset(tables, column, u2, u3, u4)
     return r, z, phi, draw_length(tables, column, u5) if media.slot[c] >= 0 else 0.0
 
@@ -163,18 +162,16 @@ def offset_of(media, tables, c, column, key):
 
 
 @njit(forceinline=True, **KERNEL)
-def aimed(world, d, c, key):
-    """Draw light that arrives from a light and is deflected by a grain of component c into the path of a walker that
-    goes along d; `key` is for this.
+def aimed(world, d, c, one, two, bits, more):
+    """Return what four words stand for of light that arrives from a light and is deflected by a grain of component c
+    into the path of a walker that goes along d.
 
-    Returns the direction toward the light, its radiance and weight, 0 where there is nothing to draw; the cosine of
-    the deflection, r, z and phi_Delta, the path length [R], 1 where there are none; and the key that is used up.
+    That is the direction toward the light, its radiance and weight, 0 where there is nothing to draw; the cosine of
+    the deflection, r, z and phi_Delta, and the path length [R], 1 where there are none.
     """
     media, tables = world.media, world.tables
-    u0, u1 = halves(key)
-    key += GOLDEN
-    bits = mix(key)
-    toward, light_pdf, light = draw_light(world.lights, u0, u1, unit(bits))
+    u0, u1 = halves(one)
+    toward, light_pdf, light = draw_light(world.lights, u0, u1, unit(two))
     cosine, column, phase = dot(d, toward), 0, 0.0
     r, z, phi, length = 0.0, 0.0, 0.0, 1.0
     if light_pdf > 0.0:
@@ -186,14 +183,12 @@ def aimed(world, d, c, key):
         else:
             phase = 0.25 / math.pi
     if not phase > 0.0:
-        return toward, light, 0.0, cosine, r, z, phi, length, key
-    key += GOLDEN
+        return toward, light, 0.0, cosine, r, z, phi, length
     if media.traits.jumps:
-        r, z, phi, length = offset_of(media, tables, c, column, key)
-        key += GOLDEN
+        r, z, phi, length = offset_of(media, tables, c, column, bits, more)
     elif media.traits.tabulated and media.slot[c] >= 0:
-        length = draw_length(tables, column, unit(mix(key)))
-    return toward, light, phase / (light_pdf + phase), cosine, r, z, phi, length, key
+        length = draw_length(tables, column, unit(bits))
+    return toward, light, phase / (light_pdf + phase), cosine, r, z, phi, length
 
 
 @njit(forceinline=True, **KERNEL)
@@ -222,9 +217,13 @@ def connect(world, batch, w, amounts, p, c, share, bound):
     the probability that this is done at all; nothing is nearer than `bound`.
     """
     media, d = world.media, triple(w.d)
-    toward, light, weight, cosine, r, z, phi, length, key = aimed(world, d, c, mix(w.key ^ OTHER))
+    key = mix(w.key ^ OTHER)
+    toward, light, weight, cosine, r, z, phi, length = aimed(
+        world, d, c, key, mix(key + GOLDEN), mix(key + GOLDEN + GOLDEN), mix(key + GOLDEN + GOLDEN + GOLDEN)
+    )
     if not weight > 0.0:
         return
+    key += (np.uint64(2) + np.uint64(media.traits.jumps)) * GOLDEN
     number = born(batch, amounts)
     shadow, its_amounts = batch.out[number], batch.out_amounts[number]
     amount, offset = media.scale[c] * length, (0.0, 0.0, 0.0)
@@ -262,8 +261,22 @@ def aim(w, offset, size, d_out, amount, c):
 
 @njit(forceinline=True, **KERNEL)
 def deflection(world, c, u0, key):
+    """Return what `deflected` does for the words that follow a key, and the key that is used up."""
+    cosine, pdf, r, z, phi, length = deflected(world, c, u0, mix(key + GOLDEN), mix(key + GOLDEN + GOLDEN))
+    return cosine, pdf, r, z, phi, length, key + words_of(world.media.traits) * GOLDEN
+
+
+@njit(forceinline=True, **KERNEL)
+def words_of(traits):
+    """Return how many words `deflected` takes."""
+    two = traits.jumps and not traits.joint
+    return np.uint64(traits.tabulated) + np.uint64(traits.tabulated and two)
+
+
+@njit(forceinline=True, **KERNEL)
+def deflected(world, c, u0, bits, more):
     """Return the cosine of the deflection by a grain of component c that u0 stands for, its density per steradian, -1
-    for an atom, r, z, phi_Delta and path length [R], 1 where there are none, and the key that is used up."""
+    for an atom, and r, z, phi_Delta and path length [R], 1 where there are none, that two words stand for."""
     media, tables = world.media, world.tables
     traits, slot = media.traits, media.slot[c]
     r, z, phi, length = 0.0, 0.0, 0.0, 1.0
@@ -272,14 +285,11 @@ def deflection(world, c, u0, key):
         pdf = density(tables, column)
         if pdf <= 0.0:
             pdf = -1.0
-        key += GOLDEN
-        bits = mix(key)
         if traits.joint:
             r, z, phi, length = draw_record(tables, column, unit(bits))
         elif traits.jumps:
             u2, u3 = halves(bits)
-            key += GOLDEN
-            u4, u5 = halves(mix(key))
+            u4, u5 = halves(more)
             r, z, phi = draw_offset(tables, column, u2, u3, u4)
             if slot >= 0:
                 length = draw_length(tables, column, u5)
@@ -290,7 +300,7 @@ def deflection(world, c, u0, key):
         pdf = lobe_density(media.g[c], cosine)
     else:
         cosine, pdf = 1.0 - 2.0 * u0, 0.25 / math.pi
-    return cosine, pdf, r, z, phi, length, key
+    return cosine, pdf, r, z, phi, length
 
 
 @njit(**KERNEL)
