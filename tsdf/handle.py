@@ -10,6 +10,7 @@ to its NamedTuple, and a kernel that is written for handles takes the NamedTuple
 import hashlib
 import operator
 import struct
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -64,12 +65,18 @@ def _named(name: str, *what: str) -> str:
     return f"{name}#{hashlib.sha256('; '.join(what).encode()).hexdigest()[:12]}"
 
 
+@cache
+def _array(dtype: np.dtype, dimensions: int) -> types.Type:
+    """Return the type of an array; making one takes as long as some hundred steps of a walker."""
+    return types.Array(from_dtype(dtype), dimensions, "C")
+
+
 def _laid(value: Any, kept: list[np.ndarray]) -> tuple[list[int], types.Type]:
     """Return a value as words, and its type; what they point to is added to `kept`."""
     if isinstance(value, np.ndarray):
         if not value.flags.c_contiguous:
             raise TypeError("an array in a handle must be C-contiguous")
-        return [value.ctypes.data, *value.shape], types.Array(from_dtype(value.dtype), value.ndim, "C")
+        return [value.ctypes.data, *value.shape], _array(value.dtype, value.ndim)
     if isinstance(value, bool | np.bool_):
         return [int(value)], types.boolean
     if isinstance(value, int | np.integer):

@@ -31,7 +31,7 @@ from tsdf.walk.transport import CameraArrays
 SLOTS = 2048  # walkers under way at once, per thread, but for shadows: their state stays in the second-level cache
 ROOM = 4 * SLOTS
 BLOCK = 65536  # samples of a block, about: the last few walkers of each wait for the ray engine alone
-LEAST = 4096  # samples of a block, however few are asked for
+LEAST, LEAST_ABREAST = 4096, 16384  # samples of a block, however few are asked for, alone and in lanes, which are soon through
 PIECES = 128  # of a pass: with few, threads wait for the one whose part of the picture is slowest
 PARTS = 16  # of the time, so that it is kept; and blocks of the largest pass
 FEW = 16  # samples per pixel of a pass of a large picture; the first has one, so that soon no pixel is black
@@ -277,7 +277,7 @@ def measure(
     pool[0].follow(transport.Job(camera, 0, 1, 0, seed), 1, halt)  # compiles, outside the time
     for walkers in pool:
         walkers.counters[:] = 0
-    free = list(pool)
+    free, least = list(pool), LEAST if pool[0].lanes is None else LEAST_ABREAST
     begin, worked = time.perf_counter(), time.process_time()
 
     def follow(block: Portion) -> np.ndarray:
@@ -300,7 +300,7 @@ def measure(
         try:
             while not stop.is_set() and (share := goal.following(done, share, took, spent(), count)) > 0:
                 found, start = 0, time.perf_counter()
-                for block, radiance in _in_turn(executor, follow, _blocks(count, done, share), 2 * threads, stop):
+                for block, radiance in _in_turn(executor, follow, _blocks(count, done, share, least), 2 * threads, stop):
                     sums.add(block, radiance)
                     found += block.number * block.pixels
                     if progress is not None:
@@ -333,9 +333,10 @@ class Portion(NamedTuple):
     sample: int
 
 
-def _blocks(count: int, done: int, share: int) -> Iterator[Portion]:
-    """Yield the blocks of a pass of `share` samples over `count` pixels, each of which has `done` of them already."""
-    size = min(max(share * count // PIECES, LEAST), BLOCK)
+def _blocks(count: int, done: int, share: int, least: int) -> Iterator[Portion]:
+    """Yield the blocks of a pass of `share` samples over `count` pixels, each of which has `done` of them already; they
+    have `least` samples, if there are so many."""
+    size = min(max(share * count // PIECES, least), BLOCK)
     number = min(share, size)
     step = max(1, size // number)
     for sample in range(done, done + share, number):
