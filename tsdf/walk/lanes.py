@@ -50,8 +50,8 @@ STEPS = 4096  # of all lanes together, before others have their turn
 PX, PY, PZ, DX, DY, DZ, PDF, FREE, BOUND, LUCK, WEIGHT, WAITS = range(12)
 WAY, COSINE, TURN, R, Z, PHI, LENGTH, BACK, TX, TY, TZ, RED, GREEN, BLUE = range(12, 26)
 KEPT, NUMBERS = 12, 26
-KEY, SAMPLE, MET, ONCE, STATE, KIND, AIMED, ONE, TWO, BITS, MORE = range(11)  # words of a lane
-WORDS_KEPT, WORDS = 6, 11
+KEY, SAMPLE, MET, ONCE, STATE, KIND, AIMED, ONE, TWO, BITS, MORE = range(11)  # words of a lane, so too
+WORDS_KEPT, WORDS = 5, 11
 WALKS, LIGHT, LOST, DEAD = range(4)  # STATE of a lane: it goes on, finds light, is handed over, or roulette ended it
 LIVE, NEXT, READY, HANDED = range(4)  # of `Lanes.counts`
 
@@ -69,6 +69,7 @@ class Lanes(NamedTuple):
     amounts: np.ndarray
     gone: np.ndarray
     ready: np.ndarray
+    others: np.ndarray
     counts: np.ndarray
 
 
@@ -82,7 +83,7 @@ def lanes_of(amounts: int) -> Lanes:
     """Return lanes without walkers, for so many amounts."""
     return Lanes(
         np.zeros(NUMBERS * STRIDE), np.zeros(WORDS * STRIDE, np.uint64), np.zeros((2 * WIDTH + 1, amounts)),
-        np.zeros(WIDTH, np.int64), np.zeros(WIDTH, np.int64), np.zeros(4, np.int64),
+        *np.zeros((3, WIDTH), np.int64), np.zeros(4, np.int64),
     )  # fmt: skip
 
 
@@ -253,9 +254,17 @@ def arrive(g, leaps, lanes, count):
         words[at(MET, i)], words[at(ONCE, i)] = np.uint64(not inside), np.uint64(inside)
         words[at(STATE, i)] = np.uint64(WALKS) if inside or met else np.uint64(LIGHT)
     for i in range(WIDTH, WIDTH + count):
-        numbers[at(WAITS, i)] = wait(leaps, words[at(ONCE, i)], numbers[at(BOUND, i)])
         for k in range(lanes.amounts.shape[1]):
             lanes.amounts[i, k] = 0.0
+    if deep(leaps):
+        for i in range(WIDTH, WIDTH + count):
+            numbers[at(WAITS, i)] = wait(leaps, words[at(ONCE, i)], numbers[at(BOUND, i)])
+
+
+@njit(forceinline=True, **KERNEL)
+def deep(leaps):
+    """Return whether there are any leaps."""
+    return leaps.size[0, ROOM] < math.inf
 
 
 @njit(forceinline=True, **KERNEL)
@@ -314,13 +323,11 @@ def fly(world, lanes, first, last):
 def choose(media, lanes):
     """Choose the component of the grain that each lane has come to."""
     words, last = lanes.words, media.kinds[0] - 1
-    for i in range(lanes.counts[LIVE]):
-        c = 0
-        if last > 0:
-            words[at(KEY, i)] += GOLDEN
-            u = unit(mix(words[at(KEY, i)]))
-            while c < last and u >= media.choice[c]:
-                c += 1
+    for i in range(lanes.counts[LIVE] if last > 0 else 0):
+        words[at(KEY, i)] += GOLDEN
+        u, c = unit(mix(words[at(KEY, i)])), 0
+        while c < last and u >= media.choice[c]:
+            c += 1
         words[at(KIND, i)] = np.uint64(c)
 
 
@@ -391,7 +398,7 @@ def land(world, lanes):
         words[at(MET, i)] += np.uint64(1)
         words[at(ONCE, i)] = np.uint64(back > 0.0)
         words[at(STATE, i)] = np.uint64(LIGHT) if out else np.uint64(WALKS)
-    for i in range(lanes.counts[LIVE]):
+    for i in range(lanes.counts[LIVE] if deep(leaps) else 0):
         if numbers[at(WAITS, i)] < 0.0:
             numbers[at(WAITS, i)] = wait(leaps, words[at(ONCE, i)], numbers[at(BOUND, i)])
 
@@ -568,14 +575,15 @@ def welcome(world, batch, lanes, job, count):
     lanes.counts[NEXT] += count
     arrive(world.geometry, world.leaps, lanes, count)
     fly(world, lanes, WIDTH, WIDTH + count)
-    ready = 0
+    ready, other = 0, 0
     for i in range(WIDTH, WIDTH + count):
-        lanes.ready[ready] = i
         walks = lanes.words[at(STATE, i)] == np.uint64(WALKS)
-        ready += walks
-        if not walks:
-            settle(world, batch, lanes, i)
+        lanes.ready[ready] = i
+        lanes.others[other] = i
+        ready, other = ready + walks, other + (not walks)
     lanes.counts[READY] = ready
+    for k in range(other):
+        settle(world, batch, lanes, lanes.others[k])
 
 
 @njit(**KERNEL)
@@ -612,7 +620,7 @@ def relieve(world, batch, lanes, job, total):
 def walk(world, batch, lanes, job, total):
     """Walk the samples of a job, `total` of them, until all have found light, or so many steps have been taken or so
     many walkers handed over that others must have their turn."""
-    counts, leaps = lanes.counts, world.leaps.size[0, ROOM] < math.inf
+    counts, leaps = lanes.counts, deep(world.leaps)
     counts[HANDED] = 0
     for _ in range(STEPS):
         fly(world, lanes, 0, counts[LIVE])
