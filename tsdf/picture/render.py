@@ -31,7 +31,8 @@ from tsdf.walk.transport import CameraArrays
 SLOTS = 2048  # walkers under way at once, per thread, but for shadows: their state stays in the second-level cache
 ROOM = 4 * SLOTS
 BLOCK = 65536  # samples of a block, about: the last few walkers of each wait for the ray engine alone
-LEAST, LEAST_ABREAST = 4096, 16384  # samples of a block, however few are asked for, alone and in lanes, which are soon through
+LEAST = 4096  # samples of a block, however few are asked for
+LEAST_IN_LANES = 4 * LEAST  # for they take a third of the time
 PIECES = 128  # of a pass: with few, threads wait for the one whose part of the picture is slowest
 PARTS = 16  # of the time, so that it is kept; and blocks of the largest pass
 FEW = 16  # samples per pixel of a pass of a large picture; the first has one, so that soon no pixel is black
@@ -277,7 +278,7 @@ def measure(
     pool[0].follow(transport.Job(camera, 0, 1, 0, seed), 1, halt)  # compiles, outside the time
     for walkers in pool:
         walkers.counters[:] = 0
-    free, least = list(pool), LEAST if pool[0].lanes is None else LEAST_ABREAST
+    free, least = list(pool), LEAST if pool[0].lanes is None else LEAST_IN_LANES
     begin, worked = time.perf_counter(), time.process_time()
 
     def follow(block: Portion) -> np.ndarray:
@@ -300,7 +301,9 @@ def measure(
         try:
             while not stop.is_set() and (share := goal.following(done, share, took, spent(), count)) > 0:
                 found, start = 0, time.perf_counter()
-                for block, radiance in _in_turn(executor, follow, _blocks(count, done, share, least), 2 * threads, stop):
+                for block, radiance in _in_turn(
+                    executor, follow, _blocks(count, done, share, least), 2 * threads, stop
+                ):
                     sums.add(block, radiance)
                     found += block.number * block.pixels
                     if progress is not None:

@@ -1,14 +1,12 @@
 """Light in a lone box: many walkers at once, in lanes, step by step together.
 
-Where nothing is in a scene but one medium in a box or a slab, `transport.wander` is what nearly all walkers do, and what
-keeps a processor waiting is that each of their steps needs the one before it and ends in a branch that nobody can guess.
-Here the walkers of some hundred samples lie in lanes, one number of all of them after the other, and take each step
-together, so that the compiler works out several at once: a flight, a grain, the jump to where light leaves it. Those
-that are out have found their light, and the next samples take their lanes.
-
-A sample's random numbers, and what is done with them, are those of `transport`, in the same order; a reader may hold
-`fly` against the first half of `wander` and `land` against its second. What is rare is handed over as it stands, and
-goes on as a walker of `transport`.
+Where nothing is in a scene but one medium in a box or a slab, `transport.wander` is what nearly all walkers do, and a
+processor waits: each of their steps needs the one before it and ends in a branch that nobody guesses. Here walkers lie
+in lanes, each number of all of them side by side, and take a step together, so that the compiler works out several at
+once: a flight, a grain, the jump to where light leaves it. Those that are out find their light, and the next samples
+take their lanes. A sample's random numbers, and what is done with them, are those of `transport`, in the same order: a
+reader may hold `fly` against the first half of `wander` and `land` against its second. Loops without branches are those
+that the compiler works out several turns at once of. What is rare is handed over as it stands, to go on alone.
 """
 
 import math
@@ -16,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tsdf.compiled import bits_of, float_of, njit
+from tsdf.compiled import njit
 from tsdf.data.sampler import leave
 from tsdf.sampling import GOLDEN, key_of, mix, unit
 from tsdf.vectors import KERNEL, dot, renewed, step, triple
@@ -25,7 +23,8 @@ from tsdf.walk.grid import GRAZING
 from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, ROOM, leap, missing, patience
 from tsdf.walk.lights import radiance as light_from
 from tsdf.walk.room import BOX, SLAB
-from tsdf.walk.transport import HAIR, aimed, carried, deflected, words_of
+from tsdf.walk.sides import HAIR, depth, landing, logarithm, sides, way_in, way_out
+from tsdf.walk.transport import aimed, carried, deflected, pixel_of, words_of
 from tsdf.walk.walker import (
     DIM,
     EVENTS,
@@ -60,8 +59,9 @@ class Lanes(NamedTuple):
     """Walkers in lanes.
 
     numbers (NUMBERS * STRIDE,), words (WORDS * STRIDE,) uint64, amounts (2 WIDTH + 1, a): of the lanes that walk, from
-    0 on, and from WIDTH on of those that are about to, and room for a shadow's amounts; gone, ready (WIDTH,): lanes whose walk has ended, and that can be
-    taken; counts (4,): lanes that walk, the next sample, how many are ready, walkers handed over.
+    0 on, and from WIDTH on of those that are about to, and room for a shadow's amounts. gone, ready, others (WIDTH,):
+    lanes whose walk has ended, and of those that are about to, which do walk and which do not. counts (4,): lanes that
+    walk, the next sample, how many are ready, walkers handed over.
     """
 
     numbers: np.ndarray
@@ -83,29 +83,11 @@ def lanes_of(amounts: int) -> Lanes:
     """Return lanes without walkers, for so many amounts."""
     return Lanes(
         np.zeros(NUMBERS * STRIDE), np.zeros(WORDS * STRIDE, np.uint64), np.zeros((2 * WIDTH + 1, amounts)),
-        *np.zeros((3, WIDTH), np.int64), np.zeros(4, np.int64),
+        np.zeros(WIDTH, np.int64), np.zeros(WIDTH, np.int64), np.zeros(WIDTH, np.int64), np.zeros(4, np.int64),
     )  # fmt: skip
 
 
 # ------------------------------------------------------------------------------------------- arithmetic
-
-
-@njit(forceinline=True, **KERNEL)
-def logarithm(x):
-    """Return the natural logarithm of x > 0 to some ulps, by the series of the inverse hyperbolic tangent."""
-    bits = bits_of(x)
-    exponent = (bits >> 52) - 1023
-    m = float_of((bits & 0x000FFFFFFFFFFFFF) | 0x3FF0000000000000)
-    large = m > math.sqrt(2.0)
-    m = 0.5 * m if large else m
-    e = float(exponent) + (1.0 if large else 0.0)
-    s = (m - 1.0) / (m + 1.0)
-    q = s * s
-    q2 = q * q
-    q4 = q2 * q2
-    low = (1.0 / 3 + q * (1.0 / 5)) + q2 * (1.0 / 7 + q * (1.0 / 9))
-    high = (1.0 / 11 + q * (1.0 / 13)) + q2 * (1.0 / 15 + q * (1.0 / 17)) + q4 * (1.0 / 19 + q * (1.0 / 21))
-    return e * math.log(2.0) + 2.0 * (s + s * q * (low + q4 * high))
 
 
 @njit(forceinline=True, **KERNEL)
@@ -127,69 +109,6 @@ def put(numbers, field, i, v):
 
 
 @njit(forceinline=True, **KERNEL)
-def sides(g):
-    """Return the lowest and highest coordinates of the medium, infinite along a slab."""
-    s, wide = g.shape, g.kind[0] == SLAB
-    return (
-        (-math.inf if wide else s[0, 0], -math.inf if wide else s[0, 1], s[0, 2]),
-        (math.inf if wide else s[0, 3], math.inf if wide else s[0, 4], s[0, 5]),
-    )
-
-
-@njit(forceinline=True, **KERNEL)
-def depth(low, high, p):
-    """Return how far p is inside of its sides, as `room.exact_depth`."""
-    z = min(p[2] - low[2], high[2] - p[2])
-    return min(z, min(min(p[0] - low[0], high[0] - p[0]), min(p[1] - low[1], high[1] - p[1])))
-
-
-@njit(forceinline=True, **KERNEL)
-def between(low, high, at, d):
-    """Return where a ray is between two planes, as `geometry._between`, and 1 / d."""
-    low, high = low - at, high - at
-    begins = low < 0.0 < high
-    each = 1.0 / d
-    a, b = low * each, high * each
-    near, far = min(a, b), max(a, b)
-    still = d == 0.0
-    near = (-math.inf if begins else math.inf) if still else near
-    far = (math.inf if begins else -math.inf) if still else far
-    return near, far, each
-
-
-@njit(forceinline=True, **KERNEL)
-def way_in(low, high, p, d):
-    """Return where a ray from outside comes in, infinite if nowhere, and 1 over the part of d across the side where it
-    does; as `geometry.exact_hit`."""
-    near, far, each = between(low[2], high[2], p[2], d[2])
-    a, b, across = between(low[1], high[1], p[1], d[1])
-    each = across if a >= near else each
-    near, far = a if a >= near else near, b if b <= far else far
-    a, b, across = between(low[0], high[0], p[0], d[0])
-    each = across if a >= near else each
-    near, far = a if a >= near else near, b if b <= far else far
-    return near if 0.0 <= near <= far else math.inf, each
-
-
-@njit(forceinline=True, **KERNEL)
-def way_out(low, high, p, e, d):
-    """Return where a ray from inside along e goes out, 1 over the part of e across the side where it does, and how far
-    d points outward there; as `geometry.exact_hit`, with one division."""
-    x = high[0] - p[0] if e[0] > 0.0 else p[0] - low[0]
-    y = high[1] - p[1] if e[1] > 0.0 else p[1] - low[1]
-    z = high[2] - p[2] if e[2] > 0.0 else p[2] - low[2]
-    size, along, outward = z, abs(e[2]), d[2] if e[2] > 0.0 else -d[2]
-    first = y * along <= size * abs(e[1])
-    size, along = y if first else size, abs(e[1]) if first else along
-    outward = (d[1] if e[1] > 0.0 else -d[1]) if first else outward
-    first = x * along <= size * abs(e[0])
-    size, along = x if first else size, abs(e[0]) if first else along
-    outward = (d[0] if e[0] > 0.0 else -d[0]) if first else outward
-    each = 1.0 / along
-    return size * each, each, outward
-
-
-@njit(forceinline=True, **KERNEL)
 def give(world, batch, sample, amounts, weight, light):
     """Add light to a sample, less what the amounts of matter that it has crossed take; see `walker.find`."""
     left = (1.0, 1.0, 1.0)
@@ -208,18 +127,18 @@ def give(world, batch, sample, amounts, weight, light):
 def begin(lanes, job, first, count):
     """Have the samples first .. first + count - 1 of a job ready behind the lanes that walk; see `transport.spawn`."""
     numbers, words, camera = lanes.numbers, lanes.words, job.camera
-    pixel, number = job.pixel + first // job.spp, job.sample + first % job.spp
-    last = job.sample + job.spp
+    at_pixel, number = first // job.spp, job.sample + first % job.spp
+    pixel, last = pixel_of(job, at_pixel), job.sample + job.spp
     x, y = pixel % camera.width, pixel // camera.width
     for i in range(WIDTH, WIDTH + count):
         words[at(KEY, i)], words[at(MET, i)] = np.uint64(pixel), np.uint64(number)
         numbers[at(PX, i)], numbers[at(PY, i)] = float(x), float(y)
         words[at(SAMPLE, i)] = np.uint64(first + i - WIDTH)
         number += 1
-        if number == last:
-            number, pixel, x = job.sample, pixel + 1, x + 1
-            if x == camera.width:
-                x, y = 0, y + 1
+        if number == last and i + 1 < WIDTH + count:
+            at_pixel, number = at_pixel + 1, job.sample
+            pixel = pixel_of(job, at_pixel)
+            x, y = pixel % camera.width, pixel // camera.width
     seed = job.seed
     corner, right, down = camera.corner, camera.right, camera.down
     origin, aside, below = camera.origin, camera.aside, camera.below
@@ -282,7 +201,7 @@ def fly(world, lanes, first, last):
     g, media, numbers, words = world.geometry, world.media, lanes.numbers, lanes.words
     mean, hair = media.free[0], HAIR * g.slack[0]
     low, high = sides(g)
-    most = np.uint64(min(PATIENCE, media.limit) - 1)
+    most = np.uint64((media.limit if deep(world.leaps) else min(PATIENCE, media.limit)) - 1)
     for i in range(first, last):
         p, d = three(numbers, PX, i), three(numbers, DX, i)
         free, bound, key = numbers[at(FREE, i)], numbers[at(BOUND, i)], words[at(KEY, i)]
@@ -301,7 +220,8 @@ def fly(world, lanes, first, last):
         words[at(KEY, i)] = key
         words[at(STATE, i)] = state if walks else words[at(STATE, i)]
         put(numbers, PX, i, (p[0] if ends else end[0], p[1] if ends else end[1], p[2] if ends else end[2]))
-        numbers[at(WAY, i)] = free if walks and not ends else 0.0
+        way = free if not ends else (0.0 if lost else -1.0)
+        numbers[at(WAY, i)] = way if walks else 0.0
         numbers[at(FREE, i)] = free if ends else -1.0
         numbers[at(BOUND, i)] = bound if ends else (there if words[at(ONCE, i)] != np.uint64(0) else left)
         numbers[at(WAITS, i)] -= 1.0
@@ -311,7 +231,7 @@ def fly(world, lanes, first, last):
     least = world.absorption.least[travel]
     for i in range(first, last):
         way = numbers[at(WAY, i)]
-        if words[at(STATE, i)] == np.uint64(LIGHT) and numbers[at(FREE, i)] >= 0.0:  # it flew out
+        if way < 0.0:  # out
             d = three(numbers, DX, i)
             t, each, _ = way_out(low, high, three(numbers, PX, i), d, d)
             way = t - HAIR * g.slack[0] * min(each, GRAZING)
@@ -349,29 +269,6 @@ def deflect(world, lanes):
         numbers[at(COSINE, i)], numbers[at(PDF, i)] = cosine, pdf
         numbers[at(R, i)], numbers[at(Z, i)], numbers[at(PHI, i)] = r, z, phi
         numbers[at(LENGTH, i)] = media.scale[c] * length
-
-
-@njit(forceinline=True, **KERNEL)
-def landing(low, high, slack, p, offset, bound, d):
-    """Return whether a jump along an offset from p, around which `bound` is free, ends inside, whether it goes out, where
-    it ends, how much is free around it if it ends inside, and what part of it is beyond the boundary; light goes on
-    along d. See `transport.land`."""
-    square = dot(offset, offset)
-    part = 1.0 / math.sqrt(square)
-    size = square * part if square > 0.0 else 0.0
-    there = bound - size
-    near = there > 0.0 or size == 0.0
-    e = (offset[0] * part, offset[1] * part, offset[2] * part)
-    beyond = depth(low, high, step(p, size, e)) - HAIR * slack
-    sure = near or beyond > 0.0
-    t, each, outward = way_out(low, high, p, e, d)
-    leaves = t < size and not sure
-    out = leaves and outward > 0.0
-    move = slack * min(each, GRAZING)
-    goes = t + (move if out else -min(move, 0.5 * t)) if leaves else size
-    q, end = step(p, 1.0, offset), step(p, goes, e)
-    end = (q[0] if near else end[0], q[1] if near else end[1], q[2] if near else end[2])
-    return sure, out, end, there if near else beyond, 1.0 - t * part if leaves else 0.0
 
 
 @njit(**KERNEL)

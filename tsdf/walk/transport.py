@@ -41,6 +41,7 @@ from tsdf.walk.lights import LightArrays
 from tsdf.walk.lights import draw as draw_light
 from tsdf.walk.lights import radiance as light_from
 from tsdf.walk.room import Room
+from tsdf.walk.sides import HAIR
 from tsdf.walk.walker import (
     ASKED,
     CLEAR,
@@ -77,7 +78,6 @@ from tsdf.walk.walker import (
 )  # fmt: skip
 
 NEXT = 6.0  # [R] how far the next grain is looked for before it is known where the medium ends
-HAIR = 1e-6  # of a boundary's thickness: an event nearer than this to it may be beyond it by rounding
 
 
 class WorldArrays(NamedTuple):
@@ -111,8 +111,8 @@ NOBODY = np.zeros(0, np.int64)
 
 
 class Job(NamedTuple):
-    """Samples to take: `spp` of each pixel from `pixel` on, the first of them number `sample`. Those of each pixel
-    begin as if they had met `met` single grains, by pixel, none where it is empty."""
+    """Samples to take: `spp` of each pixel from `pixel` on, or of `pixels` if there are any, the first of them number
+    `sample`. Those of each pixel begin as if they had met `met` single grains, by pixel, none where it is empty."""
 
     camera: CameraArrays
     pixel: int
@@ -120,6 +120,13 @@ class Job(NamedTuple):
     sample: int
     seed: int
     met: np.ndarray = NOBODY
+    pixels: np.ndarray = NOBODY
+
+
+@njit(forceinline=True, **KERNEL)
+def pixel_of(job, number):
+    """Return the pixel of a job of that number."""
+    return job.pixels[number] if job.pixels.shape[0] > 0 else job.pixel + number
 
 
 @njit(forceinline=True, **KERNEL)
@@ -955,12 +962,12 @@ def advance(near, world, near_batch, batch, count):
 
 @njit(**KERNEL)
 def spawn(batch, live, job, first, count):
-    """Start walkers, behind the first `live`, for the samples first .. first + count - 1 of a job: sample i is of pixel
-    pixel + i // spp."""
+    """Start walkers, behind the first `live`, for the samples first .. first + count - 1 of a job: sample i is of its
+    pixel number i // spp."""
     camera = job.camera
     for i in range(count):
         local = first + i
-        pixel = job.pixel + local // job.spp
+        pixel = pixel_of(job, local // job.spp)
         w = batch.walkers[live + i]
         key = key_of(job.seed, pixel, job.sample + local % job.spp)
         u0, u1 = halves(mix(key + GOLDEN))
