@@ -109,6 +109,12 @@ def put(numbers, field, i, v):
 
 
 @njit(forceinline=True, **KERNEL)
+def varied(lights):
+    """Return whether light is not the same from everywhere."""
+    return lights.environment.shape[0] > 0 or lights.sun_chord2.shape[0] > 0
+
+
+@njit(forceinline=True, **KERNEL)
 def give(world, batch, sample, amounts, weight, light):
     """Add light to a sample, less what the amounts of matter that it has crossed take; see `walker.find`."""
     left = (1.0, 1.0, 1.0)
@@ -447,7 +453,9 @@ def settle(world, batch, lanes, i):
     """Let a lane that walks no more find its light, or hand its walker over."""
     numbers, state, amounts = lanes.numbers, lanes.words[at(STATE, i)], lanes.amounts[i]
     if state == np.uint64(LIGHT):
-        light = light_from(world.lights, three(numbers, DX, i), numbers[at(PDF, i)])
+        light = world.lights.constant[0], world.lights.constant[1], world.lights.constant[2]
+        if varied(world.lights):
+            light = light_from(world.lights, three(numbers, DX, i), numbers[at(PDF, i)])
         give(world, batch, lanes.words[at(SAMPLE, i)], amounts, numbers[at(WEIGHT, i)], light)
     elif state == np.uint64(LOST):
         note(batch, lanes, i)
