@@ -402,7 +402,7 @@ class Sums:
     def add(self, block: Portion, radiance: np.ndarray) -> None:
         """Add the radiance (pixels, number, 3) of a block."""
         own = slice(block.pixel, block.pixel + block.pixels)
-        planes = np.ascontiguousarray(np.moveaxis(radiance, 2, 0))  # which are summed three times as fast, copy included
+        planes = np.ascontiguousarray(np.moveaxis(radiance, 2, 0))  # summed three times as fast
         self.total[own] += np.einsum("kij->ik", planes)
         self.squares[own] += np.einsum("kij,kij->ik", planes, planes)
         self.moments.add(own, self.samples[own], radiance)

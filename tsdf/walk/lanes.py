@@ -491,6 +491,12 @@ def welcome(world, batch, lanes, job, count):
         settle(world, batch, lanes, lanes.others[k])
 
 
+@njit(forceinline=True, **KERNEL)
+def crowded(batch, lanes):
+    """Return whether so many walkers have been handed over that it is their turn."""
+    return 4 * lanes.counts[HANDED] > batch.walkers.shape[0]
+
+
 @njit(**KERNEL)
 def relieve(world, batch, lanes, job, total):
     """Settle the lanes that walk no more and let others have their place."""
@@ -502,7 +508,7 @@ def relieve(world, batch, lanes, job, total):
         settle(world, batch, lanes, lanes.gone[k])
     while gone > 0 or counts[LIVE] < WIDTH:
         if counts[READY] == 0:
-            if counts[NEXT] == total:
+            if counts[NEXT] == total or crowded(batch, lanes):
                 break
             welcome(world, batch, lanes, job, min(WIDTH, total - counts[NEXT]))
             continue
@@ -528,11 +534,13 @@ def walk(world, batch, lanes, job, total):
     counts, leaps = lanes.counts, deep(world.leaps)
     counts[HANDED] = 0
     for _ in range(STEPS):
+        if crowded(batch, lanes):
+            break
         fly(world, lanes, 0, counts[LIVE])
         relieve(world, batch, lanes, job, total)
         while leaps and soar(world, batch, lanes):
             relieve(world, batch, lanes, job, total)
-        if counts[LIVE] == 0 or 4 * counts[HANDED] > batch.walkers.shape[0]:
+        if counts[LIVE] == 0:
             break
         choose(world.media, lanes)
         if world.lights.sampled:
