@@ -115,7 +115,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", nargs="?", help="a table; without, the exact sphere of eta 1.33")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="variant of Mitsuba (llvm_ad_rgb)")
-    parser.add_argument("--spp", type=int, default=64, help="samples per pixel (64)")
+    parser.add_argument("--spp", type=int, default=128, help="samples per pixel (128)")
     parser.add_argument("--out", type=Path, default=Path("bench"), help="folder for the results")
     args = parser.parse_args()
     loader.set_variant(args.variant)
