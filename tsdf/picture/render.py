@@ -103,6 +103,8 @@ class Walkers:
         Found so far by each sample; `reserve` makes room.
     counters : (6,) int64
         See `walker.EVENTS`.
+    lanes : Lanes, optional
+        Where walkers of a lone box or slab are followed; set to None, they are followed one by one.
     """
 
     def __init__(self, world: World) -> None:
