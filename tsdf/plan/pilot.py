@@ -7,6 +7,7 @@ in one and in the other is, in the mean, the difference squared without its nois
 
 import math
 import os
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tsdf.picture.render import SLOTS, Walkers
+from tsdf.picture.render import Walkers
 from tsdf.picture.world import World, camera_of
 from tsdf.walk import transport
 
@@ -245,15 +246,5 @@ def followed(
     met: np.ndarray = transport.NOBODY,
 ) -> np.ndarray:  # fmt: skip
     """Return the radiance (n, each, 3) of samples `first` and so on of pixels that need not lie side by side."""
-    total = len(pixels) * each
-    walkers.reserve(total)
-    spawned, live = 0, 0
-    while live or spawned < total:
-        while live <= SLOTS // 2 and spawned < total:
-            number, begun = divmod(spawned, each)
-            fresh = min(SLOTS - live, each - begun)
-            walkers.spawn(live, transport.Job(camera, int(pixels[number]), each, first, seed, met), begun, fresh)
-            walkers.walkers[0][live : live + fresh]["sample"] += number * each
-            spawned, live = spawned + fresh, live + fresh
-        live = walkers.turn(live)
-    return walkers.radiance[:total].reshape(len(pixels), each, 3).copy()
+    job = transport.Job(camera, 0, each, first, seed, met, np.ascontiguousarray(pixels, np.int64))
+    return walkers.follow(job, len(pixels), threading.Event())
