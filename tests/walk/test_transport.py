@@ -384,7 +384,7 @@ def test_deep_steps_change_nothing(level, folder, ball, monkeypatch):
     made = world.build(scene_of([Mesh(folder / "box.ply")], ball, lights=under(folder, "above")), level)
     expected = reflectance(made, 20_000)
     g = made.place.arrays.grid
-    blank = g._replace(free=np.zeros((0, 0, 0), np.float32), closed=False, beyond=False)
+    blank = g._replace(shape=(0, 0, 0), closed=False, beyond=False)
     place = replace(made.place, arrays=made.place.arrays._replace(grid=blank))
     blind = reflectance(replace(made, place=place), 20_000, seed=1)
     assert blind.rays > 1.2 * expected.rays

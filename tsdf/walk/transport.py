@@ -456,13 +456,13 @@ def surface_met(g, p, d, hits, ray):
     best, which, n, slack, spurious = math.inf, NONE, (0.0, 0.0, 0.0), 0.0, False
     if g.solid and hits[ray, 0] >= 0:
         facet = hits[ray, 0]
-        planes = g.grid.planes
-        t, cosine = plane_hit(planes, facet, p, d)
-        slack = g.grid.thickness[facet]
+        facets = g.grid.facets
+        t, cosine = plane_hit(facets, facet, p, d)
+        slack = facets[facet, 13]
         if t < 0.0:
             spurious = True
         elif t < math.inf:
-            best, which, n = t, g.surface[facet], (planes[facet, 0], planes[facet, 1], planes[facet, 2])
+            best, which, n = t, g.surface[facet], (facets[facet, 0], facets[facet, 1], facets[facet, 2])
             if cosine > 0.0:
                 n = minus(n)
     if g.balls.shape[0] > 0:
@@ -488,10 +488,10 @@ def boundary_met(g, m, p, d, hits, ray, known):
     facet = hits[ray, g.engine[m]]
     if facet < 0:
         return math.inf, known, (0.0, 0.0, 0.0), 0.0, False
-    planes = g.grid.planes
-    t, cosine = plane_hit(planes, facet, p, d)
-    n = (planes[facet, 0], planes[facet, 1], planes[facet, 2])
-    return t, cosine > 0.0, n, g.grid.thickness[facet], t < 0.0
+    facets = g.grid.facets
+    t, cosine = plane_hit(facets, facet, p, d)
+    n = (facets[facet, 0], facets[facet, 1], facets[facet, 2])
+    return t, cosine > 0.0, n, facets[facet, 13], t < 0.0
 
 
 @njit(**KERNEL)
