@@ -114,7 +114,7 @@ def main(
     check_output(out, scene, *files_of(read), beside=[out.with_suffix(".png")])
     seed = read.render.seed if seed is None else seed
 
-    ahead.begin()
+    ahead.begin(read, level or read.render.level)
     with working(quiet) as work:
 
         def told(share: float, word: str) -> None:

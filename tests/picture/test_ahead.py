@@ -8,8 +8,9 @@ from tsdf.compiled import compiling
 from tsdf.data import library
 from tsdf.picture import ahead, world
 from tsdf.picture.render import render
+from tsdf.scene.levels import AUTO
 from tsdf.scene.scene import Box, Camera, ConstantLight, GrainSpec, MediumSpec, Scene, Sphere
-from tsdf.walk import transport
+from tsdf.walk import lanes, transport
 
 BEADS = GrainSpec(library.FOLDER / f"glass-beads{library.SUFFIX}")
 BODIES = (Box((-3.0,) * 3, (3.0,) * 3), Sphere((0.0, 8.0, 0.0), 3.0))
@@ -56,3 +57,25 @@ def test_nothing_is_begun_where_kernels_are_kept(monkeypatch):
     ahead.compile_all()
     ahead.begin()
     assert transport.advance._cache.process is None
+
+
+@pytest.mark.parametrize(
+    ("bodies", "level", "needed"),
+    [
+        (1, "teleport", False),
+        (2, "teleport", True),
+        (1, "explicit", True),
+        (1, "teleport-memory", True),
+        (1, "auto", True),
+    ],
+)
+def test_nothing_is_begun_for_a_lone_box(bodies, level, needed, monkeypatch):
+    begun = []
+    monkeypatch.setattr(ahead, "compile_ahead", lambda *asked: begun.append(asked))
+    media = tuple(MediumSpec(body, 0.3, 1.0, (BEADS,), packing_spheres=64) for body in BODIES[:bodies])
+    scene = Scene(Camera((20.0, 4.0, 0.0), (0.0, 4.0, 0.0), 4, 4), (ConstantLight((1.0, 1.0, 1.0)),), media)
+    ahead.begin(scene, level)
+    assert bool(begun) == needed
+    if level != AUTO:
+        made = world.build(scene, level)
+        assert lanes.suited(made.place.arrays, made.media) != needed
