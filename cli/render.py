@@ -62,7 +62,9 @@ def first_grains(
     "--spp", type=int, metavar="N",
     help="Samples per pixel.  [default: the scene's, else 64, or with auto what the 2 % take]",
 )  # fmt: skip
-@click.option("--seconds", type=float, metavar="S", help="Stop after S seconds instead.")
+@click.option(
+    "--seconds", type=float, metavar="S", help="Stop after S seconds instead, planning of level auto included."
+)
 @click.option(
     "--target-error", type=float, metavar="E",
     help="Stop when the standard error of pixels, over the mean of the picture, is below E instead.",
@@ -126,7 +128,7 @@ def main(
         for note in (*(report.notes(choice.plan) if choice.plan else ()), *made.notes):
             work.progress.note(note)
         work.progress(0.0, "starting")
-        picture = render.render(made, choice.spp, choice.seconds, choice.target_error, seed, threads, told, work.stop)
+        picture = render.render(made, choice.spp, choice.left, choice.target_error, seed, threads, told, work.stop)
         if not picture.samples.any():
             click.echo("interrupted before the first sample: nothing is written", err=True)
             return interrupt_status()
