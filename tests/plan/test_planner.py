@@ -173,7 +173,7 @@ def test_a_small_sun_is_left_to_levels_that_aim_at_it(ball: tsdf.Table, sky: flo
     strong but wide."""
     lights = (SUN, ConstantLight((sky,) * 3)) if sky else (SUN,)
     scene = replace(pile(ball, 9.0), lights=lights)
-    made = plan(scene, 0.05, seconds=2.0, threads=2)
+    made = plan(scene, 0.05, seconds=4.5, threads=2)
     one = made.chosen.candidate
     assert not one.explicit_grains and not LEVELS[one.level].traits.packed
     assert any("pilots look at suns" in note for note in made.notes)
@@ -362,7 +362,7 @@ def test_what_levels_miss_alike_is_by_the_best_measured(ball: tsdf.Table, monkey
     squares = {"volume": (0.010, 0.004), "teleport": (0.011, 0.0005), "teleport-memory": (0.002, 0.004)}
     for level in squares:
         assert run.add(Candidate(level))
-    apart = {Candidate(level): Apart(0.0, 0.001, *square) for level, square in squares.items()}
+    apart = {Candidate(level): Apart(0.0, 0.001, *square, own=square[1]) for level, square in squares.items()}
     monkeypatch.setattr(planner._Planning, "apart", lambda _, candidate: apart.get(candidate))
     best = run.without(Candidate("teleport"), run.expected["teleport"])[2]
     for level in ("volume", "teleport-memory"):
@@ -371,6 +371,9 @@ def test_what_levels_miss_alike_is_by_the_best_measured(ball: tsdf.Table, monkey
         floor = run.without(Candidate(level), run.expected[level]._replace(bias=0.0))[2]
         assert floor.value == pytest.approx(math.sqrt(0.011), rel=evidence.ALIKE) and floor.error >= 0.99 * best.error
     assert run.missed(Candidate("teleport")) is None
+    other = apart[Candidate("volume")] = Apart(0.0, 0.001, 0.04, 0.004, own=0.004)  # by more than noise
+    floor = run.without(Candidate("volume"), run.expected["volume"]._replace(bias=0.0))[2]
+    assert floor.value == pytest.approx(math.sqrt(other.square), rel=0.02)
 
 
 def test_noise_is_over_the_true_mean(ball: tsdf.Table) -> None:

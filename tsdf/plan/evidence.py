@@ -156,8 +156,8 @@ class Evidence:
     @property
     def sparkle(self) -> float:
         """How many times as much the square of texture is under the suns of the picture as under those of pilots: flat
-        facets mirror a smaller sun as much more seldom as it is brighter, curved ones make a small image of any. No level
-        but those of single grains has any of it that another could miss."""
+        facets mirror a smaller sun as much more seldom as it is brighter, curved ones make a small image of any. Only
+        levels of single grains have any of it that another could miss."""
         if self.reference is not None and not self.reference.single:
             return 1.0
         return 1.0 + (self.rarer - 1.0) * min(self.atoms / FLAT, 1.0)

@@ -488,7 +488,8 @@ class _Planning(Evidence):
         self.load = max(1.0, sum(pilot.wall for pilot in self.pilots.values()) / max(busy, 1e-9))
         if self.load > BUSY:
             self.notes.append(
-                f"processors are busy with other things: now everything takes {self.load:.1f} times as long"
+                f"processors are busy with other things: now everything takes {self.load:.1f} times as long; times of the "
+                'table are without that where it says "idle", errors after a time with it, "busy"'
             )
         if self.known > 0.0 and self.stop.is_set():
             self.notes.append("planning was interrupted: this is what pilots had seen by then")
@@ -519,8 +520,13 @@ class _Planning(Evidence):
         found = self.predictions()
         best = min(p.safe_seconds(self.target) for p in found)
         may = sorted((p for p in found if self.hopeful(p) <= NEAR * best), key=self.hopeful)
-        first = []
-        for p in may[: 0 if self.stopped() else MOST_FINALISTS]:
+        first: list[Candidate] = []
+        for p in may:
+            if len(first) == MOST_FINALISTS or self.stopped():
+                break
+            k = p.candidate.explicit_grains
+            if k and any(one.explicit_grains == k for one in first):  # what one chain misses then all do
+                continue
             if p.candidate in self.pilots or (self.spent < LATEST * self.budget and self.add(p.candidate)):
                 first.append(p.candidate)
         return first
@@ -564,7 +570,7 @@ def safest(some: Sequence[Prediction], error: Callable[[Prediction], float]) -> 
     least = TIE * min(error(p) for p in some)
     order = list(LEVELS)
     return min(
-        (p for p in some if error(p) <= least),
+        (p for p in some if not error(p) > least),  # of pilots without light nothing is
         key=lambda p: (order.index(p.candidate.level), -p.candidate.explicit_grains),
     )
 

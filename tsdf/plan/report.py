@@ -200,7 +200,7 @@ def _short_of_time(plan: Plan, able: float) -> str:
 def table(plan: Plan) -> list[str]:
     """Return a table of all candidates as lines of text."""
     after = plan.able
-    free, now = ("", "") if plan.load < BUSY else (" if nothing else ran", " as busy as now")  # processors
+    free, now = ("", "") if plan.load < BUSY else (", idle", ", busy")  # processors
     head = ["candidate", "bias %", "texture %", "error at best %", f"time to {percent(plan.target)}{free}"]
     head += [f"error after {span(plan.seconds)}{now}"] if plan.seconds is not None else []
     rows = [[*head, "by"]]
