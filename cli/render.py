@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from tsdf.picture.render import Picture
     from tsdf.picture.world import World
 
+SPOTTED, OF_DOTS = 0.1, 0.6  # [1] relative error from which on, and share of it of a hundredth of the pixels from which
+# on, noise is said to be bright dots
+
 
 def first_grains(
     context: click.Context, parameter: click.Parameter, value: str | None
@@ -190,11 +193,32 @@ def summary(world: "World", picture: "Picture", out: Path) -> None:
         f"{plain(out)}: {state} {held} samples per pixel, level {world.level}{after}, relative error {error}, "
         f"{picture.seconds:.1f} s, {picture.events / max(picture.seconds, 1e-9):.3g} grain events per second"
     )
+    if (dots := fireflies(picture)) is not None:
+        say(f"{plain(out)}: {dots}")
     for line in media(world):
         say(line)
     lost = picture.truncated + picture.faults
     if lost:
         click.echo(f"warning: {lost} paths were given up ({picture.faults} of them at a fault of a mesh)", err=True)
+
+
+def fireflies(picture: "Picture") -> str | None:
+    """Return what is to be said of a picture whose noise is that of a few bright dots; None of others."""
+    import numpy as np
+
+    each = np.sort(np.ravel(picture.variance.mean(axis=2)))
+    whole, mean = float(each.sum()), float(picture.rgb.mean())
+    few = max(each.size // 100, 1)
+    if not (0.0 < whole < math.inf and mean > 0.0 and picture.relative_error > SPOTTED):
+        return None
+    share = float(each[-few:].sum()) / whole
+    if share < OF_DOTS:
+        return None
+    middle = math.sqrt(float(each[each.size // 2])) / mean
+    return (
+        f"its noise is bright dots: 1 % of the pixels make {100.0 * share:.0f} % of it, half of all are off by less "
+        f"than {middle:.2g}; a wider sun has fewer, or a level that aims all light, volume-hg or isotropic"
+    )
 
 
 def media(world: "World") -> Iterator[str]:

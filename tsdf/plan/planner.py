@@ -488,8 +488,8 @@ class _Planning(Evidence):
         self.load = max(1.0, sum(pilot.wall for pilot in self.pilots.values()) / max(busy, 1e-9))
         if self.load > BUSY:
             self.notes.append(
-                f"processors are busy with other things: now everything takes {self.load:.1f} times as long; times of the "
-                'table are without that where it says "idle", errors after a time with it, "busy"'
+                f"processors are busy with other things: now everything takes {self.load:.1f} times as long; in the "
+                'table "idle" is without that, "busy" with it'
             )
         if self.known > 0.0 and self.stop.is_set():
             self.notes.append("planning was interrupted: this is what pilots had seen by then")
