@@ -98,7 +98,7 @@ bench: .venv/installed  ## measure speed and error side by side, into bench/
 	$(BIN)/python benchmarks/bench_render.py
 	$(BIN)/python benchmarks/bench_mitsuba.py
 
-FUZZERS := tables meshes scenes builds signals
+FUZZERS := tables meshes scenes pictures builds signals
 
 fuzz: .venv/installed  ## throw damaged and hostile files and signals at everything, for minutes; COUNT=1000 SEED=1
 	for name in $(FUZZERS); do \

@@ -80,6 +80,7 @@ def main(
     if twice := {name for name in names if names.count(name) > 1 or (name == ALL and len(names) > 1)}:
         raise UsageError(f"two results would be called {plain(min(twice))}; give scenes files of different names")
 
+    from tsdf.picture import ahead
     from tsdf.scene.scene import load, resized
     from tsdf.scene.specs import files_of
     from tsdf.study import frontier, frontier_files
@@ -96,6 +97,8 @@ def main(
         *(file for scene in read.values() for file in files_of(scene)),
     )  # fmt: skip
     found: dict[Path, Frontier] = {}
+    if read:
+        ahead.begin()
     with working(quiet) as work:
         for number, scene in enumerate(scenes):
 

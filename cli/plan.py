@@ -58,6 +58,7 @@ def main(
     if out is not None and out.suffix.lower() != ".json":
         raise UsageError(f"--out {plain(out)}: is to end in .json")
 
+    from tsdf.picture import ahead
     from tsdf.plan import planner, report
     from tsdf.scene.scene import load, resized
     from tsdf.scene.specs import files_of
@@ -65,6 +66,7 @@ def main(
     read = resized(load(scene), width)
     if out is not None:
         check_output(out, scene, *files_of(read))
+    ahead.begin()
     with working(quiet) as work:
         plan = planner.plan(read, target, seconds, None, seed, threads, work.told, work.stop)
     text = json.dumps(report.facts(plan), indent=1)

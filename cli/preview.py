@@ -79,9 +79,11 @@ def main(
     check_output(out, Path(grain), *([Path(material)] if material is not None else []))
     by_hand = times_radius(absorption, radius, 1.0, colours=True) if absorption is not None else None
 
+    from tsdf.picture import ahead
     from tsdf.study import plots
     from tsdf.study.preview import preview
 
+    ahead.begin()
     with working(quiet) as work:
         work.told(0.0, "reading the grain")
         table, mesh = table_of(grain, tabulated, eta, material, settings, threads, quiet)

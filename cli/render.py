@@ -103,7 +103,7 @@ def main(
     if sum(stop is not None for stop in (spp, seconds, target_error)) > 1:
         raise UsageError("--spp, --seconds and --target-error each say when to stop: give one")
 
-    from tsdf.picture import leaping, render
+    from tsdf.picture import ahead, leaping, render
     from tsdf.plan import report, shot
     from tsdf.scene.scene import MAX_EXPLICIT, load, resized
     from tsdf.scene.specs import files_of
@@ -119,6 +119,7 @@ def main(
     check_output(out, scene, *files_of(read), beside=[out.with_suffix(".png")])
     seed = read.render.seed if seed is None else seed
 
+    ahead.begin()
     with working(quiet) as work:
 
         def told(share: float, word: str) -> None:

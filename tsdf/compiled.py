@@ -12,7 +12,10 @@ import hashlib
 import os
 import re
 import stat
+import subprocess
+import sys
 import tempfile
+import threading
 import warnings
 from collections.abc import Callable
 from functools import cache, cached_property
@@ -220,6 +223,29 @@ def compiling() -> bool:
     return _now.count > 0
 
 
+def compile_ahead(kernel: Any, module: str) -> None:
+    """Have another process compile a kernel that is to be kept, by running a module, which says `end_with_parent`.
+
+    Nothing is done where it is kept already or cannot be, or where there is no processor for it. Who calls the kernel
+    waits for that process; whatever becomes of it, a kernel that is not kept then is compiled as ever.
+    """
+    kept = kernel._cache
+    if kept.process is None and (os.cpu_count() or 1) > 1 and kept.missing:
+        command = [sys.executable, "-P", "-m", module]
+        quiet = subprocess.DEVNULL
+        kept.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet)
+
+
+def end_with_parent() -> None:
+    """End this process when the one that began it by `compile_ahead` has ended, however that came."""
+
+    def wait() -> None:
+        os.read(0, 1)  # until nobody holds the other end
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
 class _Stamped:
     """A place for machine code, of numba's, known by all that a kernel is made of."""
 
@@ -287,6 +313,8 @@ class _Kept:
     What the kernel is made of is read at once, before an upgrade of the package can change it.
     """
 
+    process: subprocess.Popen[bytes] | None = None  # which compiles it, see `compile_ahead`
+
     def __init__(self, function: Any) -> None:
         self._function = function
         if (name := _module_of(function.__code__.co_filename)) is not None:
@@ -298,6 +326,23 @@ class _Kept:
             return _Cache(self._function)
         except RuntimeError:  # nowhere to keep it, which `_fallback` has said
             return caching.NullCache()
+
+    @property
+    def missing(self) -> bool:
+        """Whether nothing is kept yet, where it can be."""
+        try:
+            return not self._made._cache_file._load_index()
+        except AttributeError:  # numba's NullCache: there is no place for it
+            return False
+        except Exception:  # a damaged file
+            return True
+
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        if self.process is not None and self.process.poll() is None:
+            _now.on_start(None)
+            self.process.wait()
+            _now.on_end(None)
+        return self._made.load_overload(signature, context)
 
     def __getattr__(self, name: str) -> Any:
         if name in ("_function", "_made"):  # of a copy that is not whole yet

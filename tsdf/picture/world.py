@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tsdf.data import format as tsdf_format
+from tsdf.data import library
 from tsdf.data.sampler import Tables, compile_tables
 from tsdf.data.table import Table
 from tsdf.errors import SceneError, TSDFError, UsageError
-from tsdf.grain.grains import first_hit, load_grain
-from tsdf.grain.optics import Optics
+from tsdf.grain.grains import first_hit
 from tsdf.picture import image
 from tsdf.picture.footprint import met_by_pixel
 from tsdf.picture.leaping import GAMMA, checked, leaping
@@ -491,9 +491,7 @@ def _extent(medium: MediumSpec, vertices: np.ndarray | None) -> float:
 
 def _no_table() -> Table:
     """Return a table for scenes without media, whose kernels want one."""
-    from tsdf.make.scatterometer import Effort, exact_sphere  # which few scenes ask for
-
-    return exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=8, joint=1))
+    return tsdf_format.read(library.FOLDER / f"glass-beads{library.SUFFIX}")
 
 
 def _lights(scene: Scene) -> tuple[LightArrays, list[str]]:
