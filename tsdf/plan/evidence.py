@@ -151,7 +151,8 @@ class Evidence:
         alike = min((max(seen.square, 0.0) + unsure) / (max(part.square, 0.0) + unsure), 1.0)
         square = seen.square + alike * (whole.square - part.square)
         error = max(seen.square_error, alike * whole.square_error)
-        return seen._replace(square=square, square_error=error, few=whole.few)
+        fourth = max(seen.fourth, alike**2 * whole.fourth)
+        return seen._replace(square=square, square_error=error, few=whole.few, fourth=fourth)
 
     @property
     def sparkle(self) -> float:
