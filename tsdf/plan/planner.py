@@ -45,7 +45,7 @@ MOST_FINALISTS = 4
 LATEST = 0.7  # of the time, after which nothing more is made ready for the second round
 CHECK = 0.15  # of what is left for pilots, for looks at what is chosen and was not seen
 BRIEF, MOST_CHECKS = 0.3, 3  # [s] that such a look takes at least, and how many there are at most
-WIDE, WIDEST = 16.0, 50.0  # [deg] of suns in pilots that are smaller in the picture, which single grains would hardly
+WIDE, WIDEST = 2.0, 50.0  # [deg] of suns in pilots that are smaller in the picture, which single grains would hardly
 # ever meet, at least and at most
 RUNG = 1.4  # times as wide as the next narrower one that pilots may look at
 TAILED = 1.5  # times what noise makes of it, that the error bar of what is missed is where few pixels make most of it
