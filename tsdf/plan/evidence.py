@@ -135,7 +135,8 @@ class Evidence:
             return 0.0
         looked, each = int(pilot.looked.sum()), max(self.footprint**2, 1.0)  # pixels; facets in one, about
         glint = MIRRORED * float(suns.max()) / pilot.seen.mean / each
-        return glint**2 / looked * math.exp(-0.5 * looked * each * self.coverage / self.chance)
+        left = max(1.0 - looked / self.pixels, 0.0)  # of the picture
+        return left * glint**2 / looked * math.exp(-0.5 * looked * each * self.coverage / self.chance)
 
     def elsewhere(self, candidate: Candidate, seen: Apart) -> Apart:
         """Return how a candidate without explicit grains differs from the reference, with what one that looked at more

@@ -279,9 +279,9 @@ class _Planning(Evidence):
         )
         self.impossible |= {name: error for name, one in LEVELS.items() if one.traits.packed or one.traits.remembers}
 
-    def widen(self, sample: float) -> bool:
+    def widen(self, sample: float, measured: bool = False) -> bool:
         """Have pilots look at suns that single grains meet often enough to tell what other levels miss, where a sample
-        takes one thread so long [s]; return whether that changes any."""
+        takes one thread so long [s]; return whether that changes any. Only what is measured makes them narrower."""
         samples = OF_REFERENCE * self.budget * self.threads / max(sample, 1e-9)
         share = ENOUGH * MEETINGS / max(samples * self.coverage, 1e-9)  # of the sphere
         wide = max(WIDE, math.degrees(4.0 * math.asin(math.sqrt(min(share, 1.0)))))
@@ -293,7 +293,7 @@ class _Planning(Evidence):
             else light
             for light in self.asked.lights
         )
-        if lights == self.scene.lights or wide < self.wide:
+        if lights == self.scene.lights or (wide < self.wide and not measured):
             return False
         self.wide, self.scene = wide, replace(self.scene, lights=lights)
         self.chance = kurtosis_of(build(self.scene, "volume", leap=0.0, places=self.places).lights)
@@ -386,11 +386,12 @@ class _Planning(Evidence):
             self.notes.append(f"no level explicit here, {self.reference} stands for it: {self.impossible['explicit']}")
 
     def time_the_reference(self) -> None:
-        """See what a sample of single grains takes, and widen suns anew if that is more than was thought."""
-        if self.reference is None or not self.reference.single or not self.chance or self.wide >= WIDEST:
+        """See what a sample of single grains takes, and have suns be as wide as that asks, if it is not what was
+        thought: what pilots of wider ones see is carried over to the picture's by a law, and a few glints by chance."""
+        if self.reference is None or not self.reference.single or not self.chance:
             return
         self.round(BEGUN * self.budget, [self.reference])
-        if self.widen(self.pilots[self.reference].seen.seconds):
+        if self.widen(self.pilots[self.reference].seen.seconds, measured=True):
             self.pilots.clear()
             self.add(self.reference)
 
