@@ -444,9 +444,9 @@ def test_flat_facets_sparkle_under_small_suns(ball: tsdf.Table, monkeypatch: pyt
         scene = replace(pile(table, 120.0), lights=(replace(SUN, angular_diameter_deg=8.0),))
         run = planner._Planning(scene, 0.1, None, 0, 2)
         run.look()
+        run.refer()
         more = (run.wide / 8.0) ** 2 if flat else 1.0
         assert run.sparkle == pytest.approx(more, rel=0.05) and (more > 3.0) == flat
-        run.refer()
         assert run.add(Candidate("volume"))
         for pilot in run.pilots.values():
             pilot.counts[:] = 1
