@@ -29,6 +29,7 @@ from tsdf.scene.specs import Light
 PACKING = 0.5
 SIDE = 48  # pixels
 TURNS = 5
+REST = 0.1  # [s] in which Mitsuba's threads, which look out for more, come to rest: it takes some ms of our time
 LIGHTS = {
     "constant": {"type": "constant"},
     "directional": {"type": "directional", "direction": [-0.36, 0.48, -0.8], "irradiance": 3.0},
@@ -90,6 +91,7 @@ def row(table: Table, half: float, light: str, spp: int) -> str:
         took, picture = seconds(tpt, spp, turn)
         met = float(picture[..., -1].mean())
         other, _ = seconds(volpath, spp, turn)
+        time.sleep(REST)
         begin = time.process_time()
         ours = render.render(own, spp=spp, seed=turn)
         mine = time.process_time() - begin
@@ -113,7 +115,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", nargs="?", help="a table; without, the exact sphere of eta 1.33")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="variant of Mitsuba (llvm_ad_rgb)")
-    parser.add_argument("--spp", type=int, default=64, help="samples per pixel (64)")
+    parser.add_argument("--spp", type=int, default=128, help="samples per pixel (128)")
     parser.add_argument("--out", type=Path, default=Path("bench"), help="folder for the results")
     args = parser.parse_args()
     loader.set_variant(args.variant)

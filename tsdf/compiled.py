@@ -112,6 +112,18 @@ def fetch(typing: Any, row: Any) -> Any:
     return types.none(row), written
 
 
+@intrinsic
+def bits_of(typing: Any, x: Any) -> Any:
+    """Return the bits of a float64 as a whole number."""
+    return types.int64(types.float64), lambda context, builder, kind, args: builder.bitcast(args[0], ir.IntType(64))
+
+
+@intrinsic
+def float_of(typing: Any, bits: Any) -> Any:
+    """Return the float64 of these bits."""
+    return types.float64(types.int64), lambda context, builder, kind, args: builder.bitcast(args[0], ir.DoubleType())
+
+
 def _any(kind: Any) -> Any:
     """Return the type of an argument, of a number or a truth that is written there that of any such, of a short whole
     number that of a long one.

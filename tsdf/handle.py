@@ -10,6 +10,8 @@ to its NamedTuple, and a kernel that is written for handles takes the NamedTuple
 import hashlib
 import operator
 import struct
+from functools import cache
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,7 @@ from numba.np.arrayobj import make_array, populate_array
 from numba.np.numpy_support import from_dtype
 
 WORD = ir.IntType(64)
+TRUTH, WHOLE, REAL = bool | np.bool_, int | np.integer, float | np.floating
 
 
 class Handle:
@@ -64,26 +67,41 @@ def _named(name: str, *what: str) -> str:
     return f"{name}#{hashlib.sha256('; '.join(what).encode()).hexdigest()[:12]}"
 
 
+# Types are made once: making those of a world takes as long as some ten thousand events
+
+
+@cache
+def _array(dtype: np.dtype, dimensions: int) -> types.Type:
+    """Return the type of an array."""
+    return types.Array(from_dtype(dtype), dimensions, "C")
+
+
+@cache
+def _structure(name: str, fields: tuple[str, ...], kinds: tuple[types.Type, ...], sizes: tuple[int, ...]) -> HandleType:
+    """Return the type of a NamedTuple whose fields are of these types and so many words."""
+    at = [0, *accumulate(sizes)]
+    return HandleType(name, dict(zip(fields, zip(kinds, at, strict=False), strict=True)), at[-1])
+
+
 def _laid(value: Any, kept: list[np.ndarray]) -> tuple[list[int], types.Type]:
     """Return a value as words, and its type; what they point to is added to `kept`."""
     if isinstance(value, np.ndarray):
         if not value.flags.c_contiguous:
             raise TypeError("an array in a handle must be C-contiguous")
-        return [value.ctypes.data, *value.shape], types.Array(from_dtype(value.dtype), value.ndim, "C")
-    if isinstance(value, bool | np.bool_):
+        return [value.ctypes.data, *value.shape], _array(value.dtype, value.ndim)
+    if isinstance(value, TRUTH):
         return [int(value)], types.boolean
-    if isinstance(value, int | np.integer):
+    if isinstance(value, WHOLE):
         return [int(value) & 0xFFFFFFFFFFFFFFFF], types.int64
-    if isinstance(value, float | np.floating):
+    if isinstance(value, REAL):
         return [struct.unpack("=Q", struct.pack("=d", value))[0]], types.float64
     if not isinstance(value, tuple):
         raise TypeError(f"a handle has no room for a {type(value).__name__}")
     parts = [_laid(part, kept) for part in value]
     words = [word for part, _ in parts for word in part]
     if hasattr(value, "_fields"):
-        at = np.cumsum([0] + [len(part) for part, _ in parts]).tolist()
-        fields = {name: (kind, at[i]) for i, (name, (_, kind)) in enumerate(zip(value._fields, parts, strict=True))}
-        return words, HandleType(type(value).__name__, fields, at[-1])
+        kinds, sizes = tuple(kind for _, kind in parts), tuple(len(part) for part, _ in parts)
+        return words, _structure(type(value).__name__, value._fields, kinds, sizes)
     if not parts or any(kind != parts[0][1] for _, kind in parts):
         raise TypeError("a tuple in a handle must be of equals")
     kept.append(np.array(words, np.uint64))

@@ -30,8 +30,8 @@ from tsdf.scene.scene import (
     SurfaceSpec,
 )
 from tsdf.walk import geometry
+from tsdf.walk.cells import cells_of, free_of
 from tsdf.walk.geometry import clearance, exact_hit, unmet
-from tsdf.walk.grid import cells_of
 from tsdf.walk.room import BALL, BOX, SLAB, exact_depth, triangle_distance
 
 SHAPES = ((SLAB, (0.0, 0.0, -1.0, 0.0, 0.0, 2.0)), (BOX, (-1.0, -2.0, -0.5, 1.5, 1.0, 0.7)),
@@ -191,7 +191,7 @@ def test_ways_that_are_sure_to_meet_nothing(shape, bumpy, table):
     made.hits(points.astype(np.float32), ways.astype(np.float32), facets)
     met = np.full(len(points), math.inf)
     for row in facets:
-        n, height = g.grid.planes[row, :3], g.grid.planes[row, 3]
+        n, height = g.grid.facets[row, :3], g.grid.facets[row, 3]
         t = (height - (n * points).sum(axis=1)) / (n * ways).sum(axis=1)
         met = np.where((row >= 0) & (t < met), t, met)
     scratch = np.zeros(g.engines, np.int32)
@@ -217,7 +217,7 @@ def test_distances_bound_those_of_each_cell(bumpy, table):
     for step in (0.05, 0.2):
         counts = np.array([int(5.2 / step)] * 3)
         low = np.full(3, -2.6)
-        found = cells_of(corners, geometry.planes_of(corners), low, step, counts)[0]
+        found = free_of(cells_of(corners, geometry.planes_of(corners), low, step, counts)[0], step).reshape(counts)
         at = np.random.default_rng(4).integers(0, counts, (2000, 3))
         true = np.full(len(at), math.inf)
         exact_distances(corners, low + step * (at + 0.5), true)

@@ -7,6 +7,7 @@ import pytest
 from numba import njit
 
 from tsdf.grain.grains import first_hit, load_grain, triangle_scene
+from tsdf.walk.cells import far_of, free_of
 from tsdf.walk.geometry import box_mesh, planes_of, within
 from tsdf.walk.grid import OUTSIDE, UNKNOWN, Grid, compared, grid_of, held, home_of, march, plane_hit
 
@@ -24,7 +25,7 @@ def marched(grid, p, d, end, met, known):
 def looked_at(grid, p, d, end, met):
     for i in range(p.shape[0]):
         a, b = (p[i, 0], p[i, 1], p[i, 2]), (d[i, 0], d[i, 1], d[i, 2])
-        for facet in range(grid.corners.shape[0]):
+        for facet in range(grid.facets.shape[0]):
             compared(grid, met[i], -1, facet, a, b, end[i])
 
 
@@ -74,7 +75,7 @@ def test_first_facets(cells: int) -> None:
     looked_at(grid, p, d, end, true)
     assert known.mean() > 0.9 and (true >= 0).any(axis=0).all() and (true < 0).any(axis=0).all()
     # The first of all is found, and whatever else is found is the first of its mesh
-    t = np.array([[plane_hit(grid.planes, f, tuple(a), tuple(b))[0] if f >= 0 else math.inf for f in row]
+    t = np.array([[plane_hit(grid.facets, f, tuple(a), tuple(b))[0] if f >= 0 else math.inf for f in row]
                   for row, a, b in zip(true, p, d, strict=True)])  # fmt: skip
     first, row = t.argmin(axis=1), np.arange(RAYS)
     sure = known & (t[row, first] < math.inf)
@@ -111,10 +112,60 @@ def test_none_slips_through_edges() -> None:
         assert (met[:, 0] >= 0).all()
 
 
+def in_all(grid: Grid, p: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Return the first facets (n, meshes) by every facet looked at."""
+    found = np.full((len(p), int(grid.mesh.max()) + 1), -1, np.int32)
+    looked_at(grid, p, d, np.full(len(p), math.inf), found)
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cells", [1, 60, 1000, 20_000])
+def test_what_stands_for_many_facets_hides_none(cells: int) -> None:
+    """Slabs of cells and boxes of facets, of up to hundreds a cell, leave out none that is met: short ways, long ones,
+    and such as start on facets and run flat over them. Slabs that are too thin, or boxes too small, are noticed."""
+    corners = ball(4)
+    grid = made(corners, cells=cells)
+    rng = np.random.default_rng(5)
+    facet = rng.integers(0, len(corners), RAYS)
+    weights = rng.dirichlet((0.3, 0.3, 0.3), RAYS)
+    p, d = np.einsum("ij,ijk->ik", weights, corners[facet]), directions(rng, RAYS)
+    tilt = np.einsum("ij,ij->i", d, grid.facets[facet, :3]) * rng.choice([1.0, 0.99, 1.0 - 1e-4], RAYS)
+    d -= tilt[:, None] * grid.facets[facet, :3]
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    p -= rng.choice([1e-9, 1e-4, 0.01, 0.3], RAYS)[:, None] * d
+    true, end = in_all(grid, p, d)[:, 0], np.full(RAYS, math.inf)
+    met, known = rays(grid, p, d, end)
+    assert known.mean() > 0.9 and (true >= 0).mean() > 0.5
+    assert (met[:, 0] == true)[known].all()
+    thin, small = grid.slabs.copy(), grid.listed.copy()
+    middle = 0.5 * (thin["low"] + thin["high"])
+    thin["low"], thin["high"] = 0.5 * (thin["low"] + middle), 0.5 * (thin["high"] + middle)
+    met, known = rays(grid._replace(slabs=thin), p, d, end)
+    assert (met[:, 0] != true)[known].any()
+    small.view(np.uint8).reshape(-1, 8)[:, 5] //= 2
+    met, known = rays(grid._replace(listed=small), p, d, end)
+    assert (met[:, 0] != true)[known].any()
+
+
+def test_far_is_a_bound() -> None:
+    """Of a grid of empty cells but a few: within 0.3 % of the distance between middles where that is less than 255
+    cells along an axis, never above; and the steps are those of a king."""
+    empty = np.ones((600, 9, 5), bool)
+    empty[[0, 3, 70], [1, 8, 2], [0, 4, 1]] = False
+    far, place = far_of(empty).reshape(empty.shape), np.argwhere(empty)
+    off = np.abs(place[:, None] - np.argwhere(~empty)[None])
+    steps, straight = off.max(axis=2).min(axis=1), np.sqrt((off**2).sum(axis=2)).min(axis=1)
+    found = free_of(far, 1.0)[empty] + math.sqrt(0.75)
+    assert (far[empty] >> 8 == np.minimum(steps, 255)).all() and (far[~empty] == 0).all()
+    assert (found <= straight * (1.0 + 1e-12)).all()
+    assert (found >= 0.997 * straight)[steps < 255].all() and (steps > 255).any()
+
+
 def test_what_reaches_out_of_the_grid() -> None:
     """Much of it is left to the ray engine where a ray leaves the grid, and only there."""
     grid = made(ball(2, 3.0), cells=500)
-    assert len(grid.outer) == 0 and not grid.closed and len(grid.corners) > OUTSIDE
+    assert len(grid.outer) == 0 and not grid.closed and len(grid.facets) > OUTSIDE
     d = np.array([[1.0, 0.0, 0.0]] * 2)
     known = rays(grid, np.zeros((2, 3)), d, np.array([0.5, math.inf]))[1]
     assert known.tolist() == [True, False]

@@ -384,7 +384,7 @@ def test_deep_steps_change_nothing(level, folder, ball, monkeypatch):
     made = world.build(scene_of([Mesh(folder / "box.ply")], ball, lights=under(folder, "above")), level)
     expected = reflectance(made, 20_000)
     g = made.place.arrays.grid
-    blank = g._replace(free=np.zeros((0, 0, 0), np.float32), closed=False, beyond=False)
+    blank = g._replace(shape=(0, 0, 0), closed=False, beyond=False)
     place = replace(made.place, arrays=made.place.arrays._replace(grid=blank))
     blind = reflectance(replace(made, place=place), 20_000, seed=1)
     assert blind.rays > 1.2 * expected.rays
@@ -394,7 +394,7 @@ def test_deep_steps_change_nothing(level, folder, ball, monkeypatch):
 @pytest.mark.parametrize("level", ["teleport", "volume", "explicit", "teleport-packed"])
 @pytest.mark.parametrize("shape", ["slab", "box", "ball"])
 def test_a_shape_alone_is_as_beside_others(shape, level, folder, ball):
-    """What is answered on the spot in one exact shape alone is what looking step by step finds, to the last bit.
+    """What is answered on the spot, or in lanes, in one exact shape alone is what looking step by step finds.
 
     A ball too far and small to be met makes it look. Light from one side and a loss in the grains tell where light
     leaves, and how far it went.
@@ -404,7 +404,7 @@ def test_a_shape_alone_is_as_beside_others(shape, level, folder, ball):
     alone = Scene(OUTSIDE, (*ONE, SunLight((0.3, -0.8, 0.5), (1.0, 2.0, 3.0), 20.0)), (medium,))
     beside = replace(alone, surfaces=(black(Sphere((0.0, 900.0, 0.0), 1e-3)),))
     first, second = take(alone, level, spp=4), take(beside, level, spp=4)
-    assert (first.rgb == second.rgb).all()
+    assert np.abs(first.rgb - second.rgb).max() <= 1e-9 * second.rgb.max()
     assert first.rgb.std() > 0.1 and first.events == second.events > 0
 
 

@@ -58,7 +58,7 @@ def footprints(scene: Scene, place: Place, camera: CameraArrays) -> np.ndarray:
             row = int(g.engine[m])
             facet = first_hit(place.engines[row], starts, ways)
             there = np.flatnonzero(facet >= 0)
-            plane = g.grid.planes[place.first_facet[row] + facet[there]]
+            plane = g.grid.facets[place.first_facet[row] + facet[there]]
             slope = np.einsum("ij,ij->i", plane[:, :3], ways[there])
             gap = plane[:, 3] - plane[:, :3] @ np.array(camera.origin)
             far[there] = np.where(slope > 0.0, 0.0, gap / np.where(slope == 0.0, -1.0, slope))  # 0 from within

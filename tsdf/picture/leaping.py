@@ -14,6 +14,7 @@ from tsdf.data.table import Table
 from tsdf.errors import UsageError
 from tsdf.scene.medium import Component, free_path
 from tsdf.scene.scene import Scene
+from tsdf.walk.cells import free_of
 from tsdf.walk.geometry import MESH, Place
 from tsdf.walk.leaps import Leaps, leaps_of
 from tsdf.walk.lights import LUMINANCE, LightArrays
@@ -66,15 +67,15 @@ def deepest(place: Place, m: int, least: float = 0.0) -> float:
     if kind != MESH:
         size = 0.5 * (shape[3:] - shape[:3])
         return float(size[2] if kind == SLAB else size.min())
-    free, edge = g.grid.free, g.grid.edge
-    cells = np.flatnonzero(free.ravel() >= least)
+    free = free_of(g.grid.far, g.grid.edge)
+    cells = np.flatnonzero(free >= least)
     if not len(cells):
         return 0.0
-    cells = cells[np.argsort(-free.ravel()[cells], kind="stable")]
+    cells = cells[np.argsort(-free[cells], kind="stable")]
     cells = cells[np.unique(np.linspace(0, len(cells) - 1, LOOKED_AT).astype(np.int64))]
-    places = g.grid.low + edge * (np.stack(np.unravel_index(cells, free.shape), axis=1) + 0.5)
+    places = g.grid.low + g.grid.edge * (np.stack(np.unravel_index(cells, g.grid.shape), axis=1) + 0.5)
     inside = place.inside(m, places)
-    return float(free.ravel()[cells[inside]].max()) if inside.any() else 0.0
+    return float(free[cells[inside]].max()) if inside.any() else 0.0
 
 
 def leaping(

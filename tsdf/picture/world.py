@@ -179,7 +179,7 @@ def _shut_in(world: World, camera: CameraArrays) -> bool:
         if g.solid:
             facet = first_hit(place.engines[0], points, ways)
             met = np.flatnonzero(facet >= 0)
-            plane = g.grid.planes[facet[met]]
+            plane = g.grid.facets[facet[met]]
             cosine = np.einsum("ij,ij->i", plane[:, :3], ways[met])
             distance[met] = (plane[:, 3] - np.einsum("ij,ij->i", plane[:, :3], points[met])) / cosine
             normal[met], owner[met] = plane[:, :3], g.surface[facet[met]]

@@ -8,6 +8,7 @@ without its noise.
 
 import math
 import os
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -15,12 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tsdf.compiled import njit
-from tsdf.picture.render import SLOTS, Walkers
+from tsdf.picture.render import Walkers
 from tsdf.picture.world import World, camera_of
-from tsdf.vectors import KERNEL
 from tsdf.walk import transport
-from tsdf.walk.transport import Job, spawn
 
 PIXELS, FEWEST = 484, 64  # looked at, at most, and where samples are dear
 MORE = 1936  # looked at where few pixels make most of a difference
@@ -310,24 +308,5 @@ def followed(
     met: np.ndarray = transport.NOBODY,
 ) -> np.ndarray:  # fmt: skip
     """Return the radiance (n, each, 3) of samples `first` and so on of pixels that need not lie side by side."""
-    total = len(pixels) * each
-    walkers.reserve(total)
-    job = Job(camera, 0, each, first, seed, met)
-    spawned, live = 0, 0
-    while live or spawned < total:
-        if live <= SLOTS // 2 and spawned < total:
-            fresh = min(SLOTS - live, total - spawned)
-            _spawn(walkers.batches[0], live, job, pixels, spawned, fresh)
-            spawned, live = spawned + fresh, live + fresh
-        live = walkers.turn(live)
-    return walkers.radiance[:total].reshape(len(pixels), each, 3).copy()
-
-
-@njit(**KERNEL)
-def _spawn(batch, live, job, pixels, first, count):  # type: ignore[no-untyped-def]
-    """Start walkers, behind the first `live`, for samples first .. first + count - 1 of a job: sample i is of pixel
-    pixels[i // spp]."""
-    for i in range(count):
-        pixel, own = divmod(first + i, job.spp)
-        spawn(batch, live + i, Job(job.camera, pixels[pixel], job.spp, job.sample, job.seed, job.met), own, 1)
-        batch.walkers[live + i].sample = first + i
+    job = transport.Job(camera, 0, each, first, seed, met, np.ascontiguousarray(pixels, np.int64))
+    return walkers.follow(job, len(pixels), threading.Event())

@@ -80,7 +80,7 @@ def _to_medium(world: World, m: int, starts: np.ndarray, ways: np.ndarray) -> tu
 def _to_mesh(world: World, engine: int, starts: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance to a mesh, infinite where it is missed, and the normal of the facet."""
     facet = first_hit(world.place.engines[engine], starts, ways)
-    plane = world.place.arrays.grid.planes[np.maximum(facet, 0) + world.place.first_facet[engine]]
+    plane = world.place.arrays.grid.facets[np.maximum(facet, 0) + world.place.first_facet[engine]]
     with np.errstate(divide="ignore", invalid="ignore"):
         t = (plane[:, 3] - np.einsum("ij,ij->i", plane[:, :3], starts)) / np.einsum("ij,ij->i", plane[:, :3], ways)
     return np.where(facet >= 0, t, math.inf), plane[:, :3]

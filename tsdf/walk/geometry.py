@@ -23,7 +23,8 @@ from tsdf.grain.meshes import read_mesh
 from tsdf.scene.keys import FARTHEST
 from tsdf.scene.scene import SMALLEST, Box, MediumSpec, Mesh, Rectangle, Scene, Slab, Sphere, SurfaceSpec, called
 from tsdf.vectors import KERNEL, dot, step
-from tsdf.walk.grid import GRAZING, MOST_MEDIA, NONE, ROUNDING, Grid, free_around, grid_of, held, march
+from tsdf.walk.cells import ROUNDING
+from tsdf.walk.grid import GRAZING, MOST_MEDIA, NONE, Grid, free_around, grid_of, held, march
 from tsdf.walk.room import BALL, BOX, CLOSED, MESH, OPEN, SLAB, Room, exact_depth, room_of
 
 SLACK = 2e-6  # [of a facet's largest coordinate] a point this near to a facet is on it: 30 float32 ulps
@@ -218,7 +219,7 @@ class Place:
         if kind != MESH:
             return np.array([exact_depth(kind, self.arrays.shape[m], tuple(p)) > 0.0 for p in points], bool)
         row = int(self.arrays.engine[m])
-        return within(self.engines[row], self.arrays.grid.planes[self.first_facet[row] :, :3], points)
+        return within(self.engines[row], self.arrays.grid.facets[self.first_facet[row] :, :3], points)
 
 
 def within(engine: Any, normals: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -197,7 +197,7 @@ def way_ahead(g, met, m, p, d, free, far):
         far = math.nextafter(far, math.inf)
     for e in range(met.shape[0]):
         if met[e] != NONE:
-            far = min(far, plane_hit(g.grid.planes, met[e], p, d)[0] - g.grid.margin)
+            far = min(far, plane_hit(g.grid.facets, met[e], p, d)[0] - g.grid.margin)
     return far, True
 
 

@@ -41,6 +41,7 @@ from tsdf.walk.lights import LightArrays
 from tsdf.walk.lights import draw as draw_light
 from tsdf.walk.lights import radiance as light_from
 from tsdf.walk.room import Room
+from tsdf.walk.sides import HAIR
 from tsdf.walk.walker import (
     ASKED,
     CLEAR,
@@ -78,7 +79,6 @@ from tsdf.walk.walker import (
 )  # fmt: skip
 
 NEXT = 6.0  # [R] how far the next grain is looked for before it is known where the medium ends
-HAIR = 1e-6  # of a boundary's thickness: an event nearer than this to it may be beyond it by rounding
 
 
 class WorldArrays(NamedTuple):
@@ -112,8 +112,8 @@ NOBODY = np.zeros(0, np.int64)
 
 
 class Job(NamedTuple):
-    """Samples to take: `spp` of each pixel from `pixel` on, the first of them number `sample`. Those of each pixel
-    begin as if they had met `met` single grains, by pixel, none where it is empty."""
+    """Samples to take: `spp` of each pixel from `pixel` on, or of `pixels` if there are any, the first of them number
+    `sample`. Those of each pixel begin as if they had met `met` single grains, by pixel, none where it is empty."""
 
     camera: CameraArrays
     pixel: int
@@ -121,6 +121,13 @@ class Job(NamedTuple):
     sample: int
     seed: int
     met: np.ndarray = NOBODY
+    pixels: np.ndarray = NOBODY
+
+
+@njit(forceinline=True, **KERNEL)
+def pixel_of(job, number):
+    """Return the pixel of a job of that number."""
+    return job.pixels[number] if job.pixels.shape[0] > 0 else job.pixel + number
 
 
 @njit(forceinline=True, **KERNEL)
@@ -149,18 +156,65 @@ def bent(d, cosine, u):
 
 
 @njit(forceinline=True, **KERNEL)
-def offset_of(media, tables, c, column, key):
-    """Draw r, z, phi_Delta and the path length [R] given the deflection, from the word of `key` and the next."""
-    bits = mix(key)
+def offset_of(media, tables, c, column, bits, more):
+    """Return r, z, phi_Delta and the path length [R] that two words stand for, given the deflection."""
     if media.traits.joint:
         return draw_record(tables, column, unit(bits))
     u2, u3 = halves(bits)
-    u4, u5 = halves(mix(key + GOLDEN))
+    u4, u5 = halves(more)
     r, z, phi = draw_offset(tables, column, u2, u3, u4)
     return r, z, phi, draw_length(tables, column, u5) if media.slot[c] >= 0 else 0.0
 
 
 # ------------------------------------------------------------------------------------- next-event estimation
+
+
+@njit(forceinline=True, **KERNEL)
+def aimed(world, d, c, one, two, bits, more):
+    """Return what four words stand for of light that arrives from a light and is deflected by a grain of component c
+    into the path of a walker that goes along d.
+
+    That is the direction toward the light, its radiance and weight, 0 where there is nothing to draw; the cosine of
+    the deflection, r, z and phi_Delta, and the path length [R], 1 where there are none.
+    """
+    media, tables = world.media, world.tables
+    u0, u1 = halves(one)
+    toward, light_pdf, light = draw_light(world.lights, u0, u1, unit(two))
+    cosine, column, phase = dot(d, toward), 0, 0.0
+    r, z, phi, length = 0.0, 0.0, 0.0, 1.0
+    if light_pdf > 0.0:
+        if media.traits.tabulated:
+            column = column_of(tables, c, min(max(cosine, -1.0), 1.0))
+            phase = density(tables, column)
+        elif media.traits.lobe:
+            phase = lobe_density(media.g[c], cosine)
+        else:
+            phase = 0.25 / math.pi
+    if not phase > 0.0:
+        return toward, light, 0.0, cosine, r, z, phi, length
+    if media.traits.jumps:
+        r, z, phi, length = offset_of(media, tables, c, column, bits, more)
+    elif media.traits.tabulated and media.slot[c] >= 0:
+        length = draw_length(tables, column, unit(bits))
+    return toward, light, phase / (light_pdf + phase), cosine, r, z, phi, length
+
+
+@njit(forceinline=True, **KERNEL)
+def carried(d, toward, cosine, r, z, phi, scale):
+    """Return the offset of light that is deflected by a grain of radius `scale` from d to the direction toward a light,
+    whose cosine that is."""
+    side = step(toward, -cosine, d)
+    size = math.sqrt(dot(side, side))
+    first, _ = frame(d)
+    straight = not size > 1e-12
+    side = (
+        first[0] if straight else side[0] / size,
+        first[1] if straight else side[1] / size,
+        first[2] if straight else side[2] / size,
+    )
+    co, si = turned(phi * (0.5 / math.pi) - math.floor(phi * (0.5 / math.pi)))
+    along, aside, up = z * scale, r * co * scale, r * si * scale
+    return step(step((along * d[0], along * d[1], along * d[2]), aside, side), up, cross(d, side))
 
 
 @njit(forceinline=True, **KERNEL)
@@ -170,48 +224,22 @@ def connect(world, batch, w, amounts, p, c, share, bound):
     The grain, of component c of the walker's medium, is entered at p by the walker; its key is for this. `share` is
     the probability that this is done at all; nothing is nearer than `bound`.
     """
-    media, tables, d = world.media, world.tables, triple(w.d)
+    media, d = world.media, triple(w.d)
     key = mix(w.key ^ OTHER)
-    u0, u1 = halves(key)
-    key += GOLDEN
-    bits = mix(key)
-    toward, light_pdf, light = draw_light(world.lights, u0, u1, unit(bits))
-    if not light_pdf > 0.0:
+    toward, light, weight, cosine, r, z, phi, length = aimed(
+        world, d, c, key, mix(key + GOLDEN), mix(key + GOLDEN + GOLDEN), mix(key + GOLDEN + GOLDEN + GOLDEN)
+    )
+    if not weight > 0.0:
         return
-    cosine = dot(d, toward)
-    column = 0
-    if media.traits.tabulated:
-        column = column_of(tables, c, min(max(cosine, -1.0), 1.0))
-        phase = density(tables, column)
-    elif media.traits.lobe:
-        phase = lobe_density(media.g[c], cosine)
-    else:
-        phase = 0.25 / math.pi
-    if not phase > 0.0:
-        return
+    key += (np.uint64(2) + np.uint64(media.traits.jumps)) * GOLDEN
     number = born(batch, amounts)
     shadow, its_amounts = batch.out[number], batch.out_amounts[number]
-    amount, offset = 1.0, (0.0, 0.0, 0.0)
-    key += GOLDEN
+    amount, offset = media.scale[c] * length, (0.0, 0.0, 0.0)
     if media.traits.jumps:
-        r, z, phi, length = offset_of(media, tables, c, column, key)
-        key += GOLDEN
-        side = step(toward, -cosine, d)
-        size = math.sqrt(dot(side, side))
-        if size > 1e-12:
-            side = (side[0] / size, side[1] / size, side[2] / size)
-        else:
-            side = frame(d)[0]
-        co, si = turned(phi * (0.5 / math.pi) - math.floor(phi * (0.5 / math.pi)))
-        scale = media.scale[c]
-        amount = scale * length
-        along, aside, up = z * scale, r * co * scale, r * si * scale
-        offset = step(step((along * d[0], along * d[1], along * d[2]), aside, side), up, cross(d, side))
-    elif media.traits.tabulated:
-        amount = media.scale[c] * draw_length(tables, column, unit(mix(key))) if media.slot[c] >= 0 else 0.0
+        offset = carried(d, toward, cosine, r, z, phi, media.scale[c])
     if media.slot[c] >= 0:
         its_amounts[media.slot[c]] += amount
-    cast(w, shadow, p, toward, light, phase / (light_pdf + phase) / share, w.medium, key)
+    cast(w, shadow, p, toward, light, weight / share, w.medium, key)
     size = math.sqrt(dot(offset, offset))
     if size > 0.0:
         if size < bound:
@@ -241,8 +269,22 @@ def aim(w, offset, size, d_out, amount, c):
 
 @njit(forceinline=True, **KERNEL)
 def deflection(world, c, u0, key):
+    """Return what `deflected` does for the words that follow a key, and the key that is used up."""
+    cosine, pdf, r, z, phi, length = deflected(world, c, u0, mix(key + GOLDEN), mix(key + GOLDEN + GOLDEN))
+    return cosine, pdf, r, z, phi, length, key + words_of(world.media.traits) * GOLDEN
+
+
+@njit(forceinline=True, **KERNEL)
+def words_of(traits):
+    """Return how many words `deflected` takes."""
+    two = traits.jumps and not traits.joint
+    return np.uint64(traits.tabulated) + np.uint64(traits.tabulated and two)
+
+
+@njit(forceinline=True, **KERNEL)
+def deflected(world, c, u0, bits, more):
     """Return the cosine of the deflection by a grain of component c that u0 stands for, its density per steradian, -1
-    for an atom, r, z, phi_Delta and path length [R], 1 where there are none, and the key that is used up."""
+    for an atom, and r, z, phi_Delta and path length [R], 1 where there are none, that two words stand for."""
     media, tables = world.media, world.tables
     traits, slot = media.traits, media.slot[c]
     r, z, phi, length = 0.0, 0.0, 0.0, 1.0
@@ -251,14 +293,11 @@ def deflection(world, c, u0, key):
         pdf = density(tables, column)
         if pdf <= 0.0:
             pdf = -1.0
-        key += GOLDEN
-        bits = mix(key)
         if traits.joint:
             r, z, phi, length = draw_record(tables, column, unit(bits))
         elif traits.jumps:
             u2, u3 = halves(bits)
-            key += GOLDEN
-            u4, u5 = halves(mix(key))
+            u4, u5 = halves(more)
             r, z, phi = draw_offset(tables, column, u2, u3, u4)
             if slot >= 0:
                 length = draw_length(tables, column, u5)
@@ -269,7 +308,7 @@ def deflection(world, c, u0, key):
         pdf = lobe_density(media.g[c], cosine)
     else:
         cosine, pdf = 1.0 - 2.0 * u0, 0.25 / math.pi
-    return cosine, pdf, r, z, phi, length, key
+    return cosine, pdf, r, z, phi, length
 
 
 @njit(**KERNEL)
@@ -418,13 +457,13 @@ def surface_met(g, p, d, hits, ray):
     best, which, n, slack, spurious = math.inf, NONE, (0.0, 0.0, 0.0), 0.0, False
     if g.solid and hits[ray, 0] >= 0:
         facet = hits[ray, 0]
-        planes = g.grid.planes
-        t, cosine = plane_hit(planes, facet, p, d)
-        slack = g.grid.thickness[facet]
+        facets = g.grid.facets
+        t, cosine = plane_hit(facets, facet, p, d)
+        slack = facets[facet, 13]
         if t < 0.0:
             spurious = True
         elif t < math.inf:
-            best, which, n = t, g.surface[facet], (planes[facet, 0], planes[facet, 1], planes[facet, 2])
+            best, which, n = t, g.surface[facet], (facets[facet, 0], facets[facet, 1], facets[facet, 2])
             if cosine > 0.0:
                 n = minus(n)
     if g.balls.shape[0] > 0:
@@ -450,10 +489,10 @@ def boundary_met(g, m, p, d, hits, ray, known):
     facet = hits[ray, g.engine[m]]
     if facet < 0:
         return math.inf, known, (0.0, 0.0, 0.0), 0.0, False
-    planes = g.grid.planes
-    t, cosine = plane_hit(planes, facet, p, d)
-    n = (planes[facet, 0], planes[facet, 1], planes[facet, 2])
-    return t, cosine > 0.0, n, g.grid.thickness[facet], t < 0.0
+    facets = g.grid.facets
+    t, cosine = plane_hit(facets, facet, p, d)
+    n = (facets[facet, 0], facets[facet, 1], facets[facet, 2])
+    return t, cosine > 0.0, n, facets[facet, 13], t < 0.0
 
 
 @njit(**KERNEL)
@@ -926,12 +965,12 @@ def advance(near, world, near_batch, batch, count):
 
 @njit(**KERNEL)
 def spawn(batch, live, job, first, count):
-    """Start walkers, behind the first `live`, for the samples first .. first + count - 1 of a job: sample i is of pixel
-    pixel + i // spp."""
+    """Start walkers, behind the first `live`, for the samples first .. first + count - 1 of a job: sample i is of its
+    pixel number i // spp."""
     camera = job.camera
     for i in range(count):
         local = first + i
-        pixel = job.pixel + local // job.spp
+        pixel = pixel_of(job, local // job.spp)
         w = batch.walkers[live + i]
         key = key_of(job.seed, pixel, job.sample + local % job.spp)
         u0, u1 = halves(mix(key + GOLDEN))
