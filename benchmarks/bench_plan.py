@@ -1,7 +1,7 @@
 """Plans against what they predict: scenes that nothing was fitted to, rendered long at every candidate.
 
     python benchmarks/bench_plan.py [--only BEGINNING,..] [--drawn FIRST:LAST] [--glints FIRST:LAST]
-        [--truth SECONDS] [--each SECONDS] [--kept FOLDER] [--out FILE.json]
+        [--truth SECONDS] [--each SECONDS] [--suns DEGREES] [--kept FOLDER] [--out FILE.json]
 
 For each scene the truth is level explicit over the scene's own packing; every candidate is rendered apart, and its
 bias, texture and noise are taken from pictures whose noise is taken off. Suns that single grains hardly ever meet are 6
@@ -124,11 +124,11 @@ def photographed(
     return picture, time.process_time() - began
 
 
-def widened(scene: Scene) -> Scene:
-    """Return a scene whose suns are as bright, but not so small that single grains hardly ever meet them."""
-    suns = [isinstance(light, SunLight) and light.angular_diameter_deg < WIDER for light in scene.lights]
+def widened(scene: Scene, least: float = WIDER) -> Scene:
+    """Return a scene whose suns are as bright, but not so small that single grains hardly ever meet them [deg]."""
+    suns = [isinstance(light, SunLight) and light.angular_diameter_deg < least for light in scene.lights]
     lights = (
-        replace(light, angular_diameter_deg=WIDER) if small else light
+        replace(light, angular_diameter_deg=least) if small else light
         for light, small in zip(scene.lights, suns, strict=True)
     )
     return replace(scene, lights=tuple(lights)) if any(suns) else scene
@@ -243,13 +243,14 @@ def main() -> None:
     parser.add_argument("--kept", type=Path, help="folder where what is measured of scenes is kept and taken from")
     parser.add_argument("--truth", type=float, default=30.0, help="seconds of the truth")
     parser.add_argument("--each", type=float, default=6.0, help="seconds of each candidate")
+    parser.add_argument("--suns", type=float, default=WIDER, help="degrees that suns have at least")
     parser.add_argument("--out", type=Path, help="JSON of all numbers")
     args = parser.parse_args()
     rows: list[dict[str, Any]] = []
     pilot.LATE = math.inf  # processors that others use, too, are waited for
     with tempfile.TemporaryDirectory() as folder:
         for name, data, targets in asked_for(args, Path(folder)):
-            scene = widened(parse(data, name=name))
+            scene = widened(parse(data, name=name), args.suns)
             plans = [(target, plan(scene, target, threads=THREADS, clocks=FREE)) for target in targets]
             kept = args.kept / f"{name.replace(' ', '_').replace(':', '')}.json" if args.kept else None
             found = measured(scene, args.truth, args.each, {one.chosen.candidate for _, one in plans}, kept)

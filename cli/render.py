@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from tsdf.picture.render import Picture
     from tsdf.picture.world import World
 
+SPOTTED, OF_DOTS = 0.1, 0.6  # [1] relative error from which on, and share of it of a hundredth of the pixels from which
+# on, noise is said to be bright dots
+
 
 def first_grains(
     context: click.Context, parameter: click.Parameter, value: str | None
@@ -62,7 +65,9 @@ def first_grains(
     "--spp", type=int, metavar="N",
     help="Samples per pixel.  [default: the scene's, else 64, or with auto what the 2 % take]",
 )  # fmt: skip
-@click.option("--seconds", type=float, metavar="S", help="Stop after S seconds instead.")
+@click.option(
+    "--seconds", type=float, metavar="S", help="Stop after S seconds instead, planning of level auto included."
+)
 @click.option(
     "--target-error", type=float, metavar="E",
     help="Stop when the standard error of pixels, over the mean of the picture, is below E instead.",
@@ -127,7 +132,7 @@ def main(
         for note in (*(report.notes(choice.plan) if choice.plan else ()), *made.notes):
             work.progress.note(note)
         work.progress(0.0, "starting")
-        picture = render.render(made, choice.spp, choice.seconds, choice.target_error, seed, threads, told, work.stop)
+        picture = render.render(made, choice.spp, choice.left, choice.target_error, seed, threads, told, work.stop)
         if not picture.samples.any():
             click.echo("interrupted before the first sample: nothing is written", err=True)
             return interrupt_status()
@@ -189,11 +194,32 @@ def summary(world: "World", picture: "Picture", out: Path) -> None:
         f"{plain(out)}: {state} {held} samples per pixel, level {world.level}{after}, relative error {error}, "
         f"{picture.seconds:.1f} s, {picture.events / max(picture.seconds, 1e-9):.3g} grain events per second"
     )
+    if (dots := fireflies(picture)) is not None:
+        say(f"{plain(out)}: {dots}")
     for line in media(world):
         say(line)
     lost = picture.truncated + picture.faults
     if lost:
         click.echo(f"warning: {lost} paths were given up ({picture.faults} of them at a fault of a mesh)", err=True)
+
+
+def fireflies(picture: "Picture") -> str | None:
+    """Return what is to be said of a picture whose noise is that of a few bright dots; None of others."""
+    import numpy as np
+
+    each = np.sort(np.ravel(picture.variance.mean(axis=2)))
+    whole, mean = float(each.sum()), float(picture.rgb.mean())
+    few = max(each.size // 100, 1)
+    if not (0.0 < whole < math.inf and mean > 0.0 and picture.relative_error > SPOTTED):
+        return None
+    share = float(each[-few:].sum()) / whole
+    if share < OF_DOTS:
+        return None
+    middle = math.sqrt(float(each[each.size // 2])) / mean
+    return (
+        f"its noise is bright dots: 1 % of the pixels make {100.0 * share:.0f} % of it, half of all are off by less "
+        f"than {middle:.2g}; a wider sun has fewer, or a level that aims all light, volume-hg or isotropic"
+    )
 
 
 def media(world: "World") -> Iterator[str]:

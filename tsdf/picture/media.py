@@ -18,10 +18,9 @@ from tsdf.scene.medium import Component, VolumeParameters, free_path, volume_par
 from tsdf.scene.scene import Absorption, MediumSpec, Scene
 from tsdf.scene.specs import absorption_at
 from tsdf.walk.lights import LUMINANCE
-from tsdf.walk.walker import Attenuation, Media
+from tsdf.walk.walker import UNENDING, Attenuation, Media
 
 DARKEST = 1e-300  # albedo, so that it has a logarithm
-FARTHEST = 1e300  # free path where nothing deflects, finite so that 0 of it is 0
 LONGEST_OFFSET = math.sqrt(8.0)  # [R] r and z drawn independently: at most 2 each
 
 
@@ -150,7 +149,7 @@ def _row(
     volume = volume_parameters(components, medium.packing_fraction, [s.grey(amounts.weight) for s in spectra])
     mean_cosine = volume.g if volume.albedo > 0.0 else 0.0  # where no light leaves a grain any will do
     if traits.similar:
-        free = 1.0 / max(volume.sigma_t * (1.0 - mean_cosine), 1.0 / FARTHEST)
+        free = 1.0 / max(volume.sigma_t * (1.0 - mean_cosine), 1.0 / UNENDING)
     else:
         free = path.lambda_beta if traits.spheres else 1.0 / volume.sigma_t
 

@@ -52,7 +52,7 @@ from tsdf.walk.lights import LightArrays, compile_lights
 from tsdf.walk.memory import Memory
 from tsdf.walk.records import memory_of
 from tsdf.walk.transport import NOBODY, CameraArrays
-from tsdf.walk.walker import MAX_EVENTS, Attenuation, Media
+from tsdf.walk.walker import MAX_EVENTS, UNENDING, Attenuation, Media
 
 CAPTIVES = 32  # paths that look for a way out from the camera
 OUTLIVED = 1000.0  # of the grains met in the mean, after which a path that leaps is given up: no light lives as long
@@ -90,6 +90,8 @@ class World:
         What the user should know, one line each.
     sizes : tuple of InWords
         Of the media, in everybody's words.
+    empty : tuple of int
+        Numbers of the media, from 1 on, that no grain fits in: single grains are not there.
     met : (h * w,) int64
         Of its explicit grains, how many a pixel counts as met before it begins; () where all have as many.
     """
@@ -110,6 +112,7 @@ class World:
     parameters: tuple[VolumeParameters, ...]
     notes: tuple[str, ...]
     sizes: tuple[InWords, ...]
+    empty: tuple[int, ...] = ()
     met: np.ndarray = field(default_factory=lambda: NOBODY)
 
 
@@ -288,12 +291,13 @@ def build(
                     f"build it with {records.option}"
                 )
     memory = _memory(scene, tables if traits.remembers or traits.answered else [], traits.remembers)
-    layers = []
+    layers, empty = [], []
     for number, (medium, boundary) in enumerate(zip(scene.media, made.boundaries, strict=True), 1):
         extent = _extent(medium, boundary.vertices if boundary is not None else None)
         sticks_out = medium.inside == "centres" and boundary is None
         layers.append(extent / medium.radius - (0.0 if sticks_out else 2.0))
-        if 2.0 * medium.radius > extent and medium.inside == "grains":
+        empty.append(2.0 * medium.radius > extent and medium.inside == "grains")
+        if empty[-1]:
             notes.append(
                 f"{scene.name}: {called('medium', number, medium.name)}: a grain of diameter {2.0 * medium.radius:g} "
                 f"does not fit into the medium, which is {extent:.3g} thin: "
@@ -304,6 +308,9 @@ def build(
     compiled = compile_tables(tables or [_no_table()], joint=traits.joint)
     leaps, deep = leaping(scene, brim, media, compiled, memory, tables, gamma, lights, progress)
     met = _grains_met(scene, traits, tables, made, parameters, limit)
+    if singles:
+        media = media._replace(free=np.where(empty, UNENDING, media.free))
+        singles = 0 if all(empty) else singles  # none is met, and lights are aimed at as in a scene without
     if any(deep) and limit == MAX_EVENTS:
         longest = OUTLIVED * max(n for n, there in zip(met, deep, strict=True) if there)
         media = media._replace(limit=int(min(max(limit, longest), MOST_EVENTS)))
@@ -341,6 +348,7 @@ def build(
         parameters=parameters,
         notes=(*notes, *grains.notes),
         sizes=tuple(_sizes(scene, tables)),
+        empty=tuple(number for number, none in enumerate(empty, 1) if none),
     )
     if scene.render.fewer_far and 0 < singles < ALL:
         ready.met = met_by_pixel(scene, made, camera_of(ready), singles)

@@ -20,7 +20,10 @@ from tsdf.walk.lights import LUMINANCE
 GRAINS = (0, 3, 8, 16)  # explicit ones before a chain
 MEETINGS = 400.0  # of lights that are met by chance alone, that a pilot is believed from on: its mean, and what others
 # differ from it by, is known to a twentieth then, and the error bar of that to as much
+BESIDE = 0.06  # of them, that do where paths of the reference are held beside it that are the same but for their ends
 LEAST_PER_E = 2.0  # explicit grains of facets that bring texture down by e, at least
+TOLD, LEAST_ALIKE = 3.0, 0.5  # standard errors from which on a candidate misses other texture than all do, and what
+# of that it misses at least
 ALIKE = 0.2  # of the logarithm of an error, what two levels of teleportation may differ by
 LEAST = 1e-4  # [1] of an error
 UNSURE = 0.8  # of the logarithm of texture, what that law may be off by for other grains than spheres
@@ -85,11 +88,12 @@ class Evidence:
             and not (one.explicit_grains and "explicit" in self.impossible)
         ]
 
-    def trusted(self, pilot: Pilot) -> bool:
-        """Return whether a pilot has seen light, and met what only chance finds of it often enough to be believed."""
+    def trusted(self, pilot: Pilot, share: float = 1.0) -> bool:
+        """Return whether a pilot has seen light, and met what only chance finds of it often enough to be believed, or a
+        share of that."""
         if not pilot.seen.mean > 0.0:
             return False
-        return not (self.chance and pilot.world.media.singles) or self.often(pilot)
+        return not (self.chance and pilot.world.media.singles) or self.often(pilot, share)
 
     def often(self, pilot: Pilot, share: float = 1.0) -> bool:
         """Return whether a pilot has samples enough for lights that chance finds, or a share of enough."""
@@ -99,7 +103,7 @@ class Evidence:
         """Return whether a candidate's single grains meet lights too seldom for its variance to be known: by the pilot
         of level explicit or the reference, if that has single grains, or else by its own or one of as many samples."""
         assert self.reference is not None
-        if not singly(candidate):
+        if not candidate.single:
             return False
         best = self.pilots.get(Candidate("explicit"), self.pilots[self.reference])
         return not self.often(best if best.world.media.singles else self.pilots.get(candidate, best))
@@ -110,9 +114,11 @@ class Evidence:
         own, other = self.pilots.get(candidate), self.pilots[self.reference]
         if own is None or own is other or not own.each or not other.each:
             return None
-        if not self.trusted(own) or not self.trusted(other):
+        beside = candidate.explicit_grains > 0 and other.world.media.singles > 0  # most of their paths are the same
+        if not self.trusted(own, BESIDE if beside else 1.0) or not self.trusted(other):
             return None
-        seen, more = self.elsewhere(candidate, own.apart(other)), self.sparkle
+        met = own.seen.samples * self.coverage / self.chance if self.chance else math.inf
+        seen, more = self.elsewhere(candidate, own.apart(other, met=met if beside else None)), self.sparkle
         error = seen.square_error if candidate.explicit_grains else math.hypot(seen.square_error, self.unseen())
         bound = BOUND * (more - 1.0) * max(seen.square, 0.0)  # not all of it is glints, so this is rather too much
         # which facets mirror the real sun, of those that mirror a wider one, is chance, in a picture of few most of all
@@ -129,7 +135,8 @@ class Evidence:
             return 0.0
         looked, each = int(pilot.looked.sum()), max(self.footprint**2, 1.0)  # pixels; facets in one, about
         glint = MIRRORED * float(suns.max()) / pilot.seen.mean / each
-        return glint**2 / looked * math.exp(-0.5 * looked * each * self.coverage / self.chance)
+        left = max(1.0 - looked / self.pixels, 0.0)  # of the picture
+        return left * glint**2 / looked * math.exp(-0.5 * looked * each * self.coverage / self.chance)
 
     def elsewhere(self, candidate: Candidate, seen: Apart) -> Apart:
         """Return how a candidate without explicit grains differs from the reference, with what one that looked at more
@@ -144,14 +151,17 @@ class Evidence:
         unsure = part.square_error + LEAST**2
         alike = min((max(seen.square, 0.0) + unsure) / (max(part.square, 0.0) + unsure), 1.0)
         square = seen.square + alike * (whole.square - part.square)
-        return seen._replace(
-            square=square, square_error=max(seen.square_error, alike * whole.square_error), few=whole.few
-        )
+        error = max(seen.square_error, alike * whole.square_error)
+        fourth = max(seen.fourth, alike**2 * whole.fourth)
+        return seen._replace(square=square, square_error=error, few=whole.few, fourth=fourth)
 
     @property
     def sparkle(self) -> float:
         """How many times as much the square of texture is under the suns of the picture as under those of pilots: flat
-        facets mirror a smaller sun as much more seldom as it is brighter, curved ones make a small image of any."""
+        facets mirror a smaller sun as much more seldom as it is brighter, curved ones make a small image of any. Only
+        levels of single grains have any of it that another could miss."""
+        if self.reference is not None and not self.reference.single:
+            return 1.0
         return 1.0 + (self.rarer - 1.0) * min(self.atoms / FLAT, 1.0)
 
     def predicted(self, candidate: Candidate) -> Prediction:
@@ -215,7 +225,9 @@ class Evidence:
         elif apart is None and LEVELS[plain.level].traits.packed:  # it misses a part of the same texture
             size = math.hypot(one.bias, one.texture * self.rougher())
         floor = beliefs.of_square(size, spread, square, error)
-        if missed is not None and size:  # both are held against the same samples of the reference
+        if missed is not None and apart is not None and size:  # held against the same samples in the same pixels
+            floor = self.beside_the_best(apart, missed, bias)
+        elif missed is not None and size:
             floor = floor._replace(error=max(floor.error, missed.error))
         return bias, bias_error, floor, one.known or apart is not None
 
@@ -226,6 +238,21 @@ class Evidence:
         if best is None or best == plain or LEVELS[plain.level].traits.packed:
             return None
         return self.texture_of(best)
+
+    def beside_the_best(self, own: Apart, missed: Belief, bias: float) -> Belief:
+        """Return the floor of a candidate that misses what all do, and what it was seen to have beside that, if this is
+        more than noise."""
+        best = self.best_known()
+        other = self.apart(best) if best is not None else None
+        assert other is not None
+        square = missed.value**2 + bias**2
+        more = own.square - other.square - bias**2 + other.bias**2
+        noise = self.sparkle * math.hypot(own.own, other.own)
+        if own.pixels < other.pixels:  # which differ by what they look at as well
+            noise = math.hypot(own.square_error, other.square_error)
+        if abs(more) > TOLD * noise:
+            square = max(square + more, (LEAST_ALIKE * missed.value) ** 2)
+        return Belief(math.sqrt(square), missed.error)
 
     def texture_of(self, best: Candidate) -> Belief:
         """Return the texture that a candidate without single grains misses, by its pilot."""
@@ -362,7 +389,7 @@ class Evidence:
         """
         seen, piloted = self.cost_of_pilots(candidate)
         found = seen.variance
-        if not singly(candidate):
+        if not candidate.single:
             explicit = self.pilots.get(Candidate("explicit"))
             all_of_it = self.of_reference(explicit).variance if explicit is not None and explicit.each else math.inf
             straight = 0.0 if LEVELS[candidate.level].traits.points or not self.atoms else self.atoms * all_of_it
@@ -411,8 +438,3 @@ class Evidence:
         if self.trusted(pilot):
             return seen
         return seen._replace(variance=max(seen.variance, 0.1 * self.coverage * self.chance))
-
-
-def singly(candidate: Candidate) -> bool:
-    """Return whether a candidate meets single grains, whose light is met by chance."""
-    return candidate.explicit_grains > 0 or LEVELS[candidate.level].traits.packed

@@ -1,8 +1,9 @@
 """Pilots: short renders of some pixels at the picture's own footprint, at one candidate each.
 
 All pilots of a picture look at the same pixels, spread evenly, with the same random numbers, so that what they differ
-by is less noisy than they are. Samples come in two halves that know nothing of each other: the product of a difference
-in one and in the other is, in the mean, the difference squared without its noise.
+by is less noisy than they are: with explicit grains first most paths are the same. Samples come in two halves that know
+nothing of each other: the product of a difference in one and in the other is, in the mean, the difference squared
+without its noise.
 """
 
 import math
@@ -21,10 +22,13 @@ from tsdf.walk import transport
 
 PIXELS, FEWEST = 484, 64  # looked at, at most, and where samples are dear
 MORE = 1936  # looked at where few pixels make most of a difference
+LEAST_OF_FIRST = 0.2  # of the time of a sample as it seems, that it takes at least, where portions of two sizes tell
 FREE = 0.25  # quantile of times that stands for a processor that has nothing else to do
 FEW = 50  # one pixel in so many may make most of a difference
 LATE = 6.0  # times what is asked for that it may take on the clock, where processors are busy with other things
+MANY = 4  # times as many samples of a pixel, that portions of two sizes tell what one more takes
 HALVES = 2
+HALF = 1 << 40  # number of the first sample of the second half: one sample of a pixel is of one half in all pilots
 AT_ONCE = 1 << 15  # samples of a thread at once, at most
 
 
@@ -55,7 +59,8 @@ class Seen(NamedTuple):
 class Apart(NamedTuple):
     """How a pilot differs from another: of the mean, and the mean of the squared difference of pixels, without noise;
     over the other's mean [1], with standard errors, and what noise alone makes of the last of these. Of the square, the
-    share that one pixel in `FEW` makes of which it is most, and the mean of its own square."""
+    share that one pixel in `FEW` makes of which it is most, and the mean of its own square, what noise makes of its
+    error in these pixels, and how many these are."""
 
     bias: float
     bias_error: float
@@ -64,6 +69,21 @@ class Apart(NamedTuple):
     noise: float = 0.0
     few: float = 0.0
     fourth: float = 0.0
+    own: float = 0.0
+    pixels: int = 0
+
+
+class Mark(NamedTuple):
+    """Sums of the first `each` samples in each half of pixels `first` to `last`, (halves, n, 3)."""
+
+    first: int
+    last: int
+    each: int
+    sums: np.ndarray
+
+    def of(self, first: int, last: int) -> np.ndarray:
+        """Return those of pixels among them."""
+        return self.sums[:, first - self.first : last - self.first]
 
 
 class Pilot:
@@ -88,8 +108,9 @@ class Pilot:
         self.sums, self.squares = np.zeros((HALVES, n, 3)), np.zeros((HALVES, n, 3))
         self.counts, self.active = np.zeros(n, np.int64), 0  # the first of those that samples are taken of now
         self.busy, self.wall = 0.0, 0.0  # [s] of all threads together; on the clock
-        self.times: list[float] = []  # [s] a sample, of the largest portions, whose start is no part
-        self.largest = 0  # of them, samples
+        self.portions: dict[int, list[float]] = {}  # [s] of one thread, by how many samples of each pixel they were
+        self.marks: list[Mark] = []
+        self.like: Pilot | None = None  # whose times say how those of many samples are to those of few
         self._walkers: list[Walkers] = []
 
     @property
@@ -119,9 +140,10 @@ class Pilot:
 
     def run(self, seconds: float, stopped: Callable[[], bool] = lambda: False) -> None:
         """Take samples for about so long [s], or until stopped: of each thread, on processors that have nothing else
-        to do."""
+        to do. Portions end at powers of two as far as they can, which other pilots have come to as well."""
         self.warm()
         began, begun, share = self.clocks.wall(), self.busy, 1
+        most = max(AT_ONCE // (len(self.pixels) - self.active), 1)
         while not stopped():
             before = self.busy
             self._take(share)
@@ -129,9 +151,11 @@ class Pilot:
             left = seconds - (self.busy - begun) / self.threads
             if left < took or self.clocks.wall() - began > LATE * seconds:
                 break
-            share = max(
-                1, min(8 * share, int(0.7 * left / max(took, 1e-9)), AT_ONCE // (len(self.pixels) - self.active))
-            )
+            done = int(self.counts[self.active]) // self.threads
+            able = max(min(int(0.7 * left / max(took, 1e-9)), most), 1)
+            share = (1 << done.bit_length()) - done  # to the next power of two
+            if share > able:
+                share = 1 << (able.bit_length() - 1)
         self.wall += self.clocks.wall() - began
 
     def _take(self, each: int) -> None:
@@ -145,23 +169,21 @@ class Pilot:
             half, k = job
             mine = free.pop()
             began = self.clocks.thread(mine)
-            first = HALVES * (done + k * each) + half * each  # halves share no sample
+            first = half * HALF + done + k * each
             radiance = followed(mine, camera, active, each, first, self.seed, self.world.met)
             spent = self.clocks.thread(mine) - began
             free.append(mine)
             return half, radiance, spent
 
-        size = each * len(active)
-        if size > 2 * self.largest:
-            self.times, self.largest = [], size
         with ThreadPoolExecutor(self.threads) as pool:
             for half, radiance, spent in pool.map(work, jobs):
                 self.sums[half, self.active :] += radiance.sum(axis=1)
                 self.squares[half, self.active :] += (radiance**2).sum(axis=1)
                 self.busy += spent
-                if 2 * size > self.largest:
-                    self.times.append(spent / size)
+                self.portions.setdefault(each, []).append(spent / len(active))
         self.counts[self.active :] += self.threads * each
+        sums = self.sums[:, self.active :].copy()
+        self.marks.append(Mark(self.active, len(self.pixels), done + self.threads * each, sums))
 
     @property
     def looked(self) -> np.ndarray:
@@ -173,8 +195,7 @@ class Pilot:
         """What it saw so far."""
         seen = self.looked
         count, samples = HALVES * self.counts[seen][:, None], HALVES * int(self.counts.sum())
-        # other work on the machine only adds to it
-        each, met = float(np.quantile(self.times or [0.0], FREE)), self.events / max(samples, 1)
+        each, met = self.sample_seconds, self.events / max(samples, 1)
         if not samples:
             return Seen(0.0, math.inf, each, met, 0)
         means, squares = self.sums.sum(axis=0)[seen] / count, self.squares.sum(axis=0)[seen] / count
@@ -183,6 +204,21 @@ class Pilot:
             return Seen(0.0, math.inf, each, met, samples)
         variance = np.maximum(squares - means**2, 0.0) * count / np.maximum(count - 1, 1)
         return Seen(mean, float(variance.mean()) / mean / mean, each, met, samples)
+
+    @property
+    def sample_seconds(self) -> float:
+        """Time of a sample of one thread [s], of many samples of a pixel: the first of each takes longer, for what it
+        meets has to be fetched, and so has what begins a portion. Other work on the machine only adds to times."""
+        if not self.portions:
+            return 0.0
+        times = {each: float(np.quantile(spent, FREE)) for each, spent in self.portions.items()}
+        low, high = min(times), max(times)
+        rough, like = times[high] / high, self.like
+        if like is not None and high < MANY * low and high in like.portions and max(like.portions) > MANY * high:
+            return rough * like.sample_seconds * high / float(np.quantile(like.portions[high], FREE))
+        if low == high:
+            return rough
+        return min(max((times[high] - times[low]) / (high - low), LEAST_OF_FIRST * rough), rough)
 
     @property
     def events(self) -> int:
@@ -194,18 +230,23 @@ class Pilot:
         means: np.ndarray = self.sums[half] / np.maximum(self.counts, 1)[:, None]
         return means
 
-    def apart(self, other: "Pilot", within: "Pilot | None" = None) -> Apart:
+    def apart(self, other: "Pilot", within: "Pilot | None" = None, met: float | None = None) -> Apart:
         """Return how it differs from another of the same picture, which is not black, in pixels that both looked at, or
-        a third as well."""
+        a third as well; where most of their paths are the same, and have `met` so often what light comes from, by those
+        that both took."""
         mean, n = other.seen.mean, min(len(one.pixels) for one in (self, other, within or self))
         both = np.logical_and.reduce([one.looked[:n] for one in (self, other, within or self)])
         n = int(both.sum())
         one, two = (((self.pixel_means(h)[: len(both)] - other.pixel_means(h)[: len(both)]) / mean)[both]
                     for h in range(HALVES))  # fmt: skip
-        apart, product = 0.5 * (one + two).mean(axis=1), (one * two).mean(axis=1)
         noise = (self.noise()[: len(both)] + other.noise()[: len(both)])[both] / mean**2  # of each half; as few samples
         # may not have shown it yet
         unsure = float(np.linalg.norm(noise)) / n
+        beside = None if met is None else self._beside(other, both, mean, met)
+        if beside is not None and beside[2].sum() < noise.sum():
+            one, two, noise = beside
+            unsure = float(np.linalg.norm(noise)) / n / math.sqrt(3.0)  # each by two numbers only
+        apart, product = 0.5 * (one + two).mean(axis=1), (one * two).mean(axis=1)
         few = float(np.partition(product, -(n // FEW) - 1)[-(n // FEW) - 1 :].sum()) / max(float(product.sum()), 1e-12)
         few = min(max(few, 0.0), 1.0)
         whole = float(product.var(ddof=1)) / n
@@ -217,7 +258,28 @@ class Pilot:
         noisy = min(all_of_it, 0.5 * float(noise.mean()) / n)
         bias, bias_error = float(apart.mean()), math.sqrt(noisy + (all_of_it - noisy) * left)
         fourth = float((product**2).mean())
-        return Apart(bias, bias_error, float(product.mean()), max(error, unsure), unsure, few, fourth)
+        return Apart(bias, bias_error, float(product.mean()), max(error, unsure), unsure, few, fourth, own, n)
+
+    def _beside(
+        self, other: "Pilot", both: np.ndarray, mean: float, met: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:  # fmt: skip
+        """Return the differences of pixels in both halves, over a mean, and their noise, by as many of the first
+        samples as both took: what these met alike is no part of it. None where there are no such samples."""
+        sums, counts = np.zeros((HALVES, len(both), 3)), np.zeros(len(both))
+        for own, beside in ((a, b) for a in self.marks for b in other.marks if a.each == b.each):
+            first, last = max(own.first, beside.first), min(own.last, beside.last, len(both))
+            if first < last and own.each > counts[first:last].max():
+                sums[:, first:last] = own.of(first, last) - beside.of(first, last)
+                counts[first:last] = own.each
+        if not (counts[both] > 0).all():
+            return None
+        one, two = (sums[:, both] / counts[both][:, None]) / mean
+        # of all the pixels that make the noise of what is not held side by side, and of all the lights that were met,
+        # one may not have shown yet that it is apart
+        mine, theirs = (p.noise()[: len(both)] * p.counts[: len(both)] for p in (self, other))
+        whole = (mine + theirs)[both] / counts[both] / mean**2
+        unseen = whole * max(float(whole @ whole) / max(float(whole.sum()) ** 2, 1e-300), 1.0 / max(met, 1.0))
+        return one, two, 0.5 * ((one - two) ** 2).mean(axis=1) + unseen
 
     def noise(self) -> np.ndarray:
         """Variance of the mean of each pixel in one half, the mean of its channels (n,)."""

@@ -16,13 +16,13 @@ from tsdf.errors import SceneError, UsageError
 from tsdf.picture.trust import kurtosis_of
 from tsdf.picture.world import World, build
 from tsdf.plan import needs, prior
-from tsdf.plan.evidence import BOLD, BOLD_BIAS, GRAINS, MEETINGS, Evidence, singly
+from tsdf.plan.evidence import BOLD, BOLD_BIAS, GRAINS, MEETINGS, Evidence
 from tsdf.plan.pilot import CLOCKS, FEWEST, HALVES, MORE, PIXELS, Clocks, Pilot
-from tsdf.plan.prediction import TIE, Plan, Prediction
+from tsdf.plan.prediction import TIE, UNFINISHED, Plan, Prediction
 from tsdf.plan.report import BUSY, digits, why
 from tsdf.scene.levels import LEVELS
 from tsdf.scene.medium import Component, free_path
-from tsdf.scene.scene import Scene
+from tsdf.scene.scene import Scene, called
 from tsdf.scene.specs import SunLight
 from tsdf.spheres.packing import MAX as MOST_PACKED
 from tsdf.study.candidates import Candidate, candidates, taken
@@ -32,6 +32,7 @@ from tsdf.walk.geometry import Place, place
 TARGET = 0.02  # [1] where nothing else is asked for
 LEAST_TARGET, MOST_TARGET = 1e-4, 1.0
 SECONDS, SHARE, MOST_SECONDS = 5.0, 0.1, 20.0  # [s] of worlds and pilots; or this share of the render, up to so much
+MOST_SHARE = 1.0 / 3.0  # of a render that is said to take so long, that planning takes, by the clock
 LEAST_PILOTS = 2.0  # [s] for pilots, however long worlds take to build
 BUILDING = 0.4  # of the time, after which no more worlds are built that may want records for leaps
 TURN = 0.05  # of the time, that a sample of each pixel of the reference may take
@@ -44,9 +45,9 @@ MOST_FINALISTS = 4
 LATEST = 0.7  # of the time, after which nothing more is made ready for the second round
 CHECK = 0.15  # of what is left for pilots, for looks at what is chosen and was not seen
 BRIEF, MOST_CHECKS = 0.3, 3  # [s] that such a look takes at least, and how many there are at most
-WIDE, WIDEST = 16.0, 50.0  # [deg] of suns in pilots that are smaller in the picture, which single grains would hardly
+WIDE, WIDEST = 2.0, 50.0  # [deg] of suns in pilots that are smaller in the picture, which single grains would hardly
 # ever meet, at least and at most
-UNFINISHED = 0.5  # [1] noise of pixels over their mean, above which single grains under small suns are but bright dots
+RUNG = 1.4  # times as wide as the next narrower one that pilots may look at
 TAILED = 1.5  # times what noise makes of it, that the error bar of what is missed is where few pixels make most of it
 SOON = 0.5  # of `MEETINGS`, after the first round, that there will be enough of after the second
 ENOUGH = 4.0  # times `MEETINGS` that they are to be met in the time that the reference has
@@ -54,6 +55,14 @@ NEAR = 3.0  # times as long as the best as a candidate may seem to take to be lo
 EVENT_S = (1.0e-6, 5.0e-6)  # [s] of one explicit grain, an exact sphere and one of facets, about
 PATIENCE = 600.0  # [s] that a picture may take where nothing is said
 FEWER = 1.3  # times as large as they look in the middle, grains must look somewhere for their number to go by pixel
+
+
+def planning_seconds(seconds: float | None) -> float:
+    """Return for how long is planned [s] for a picture that may take so long: a tenth of it, but 5 s where that is
+    less, and a third at most; of processors that have nothing else to do."""
+    if seconds is None or math.isinf(seconds):
+        return SECONDS
+    return min(max(SECONDS, min(SHARE * seconds, MOST_SECONDS)), MOST_SHARE * seconds)
 
 
 def checked_target(target: float, name: str = "target") -> float:
@@ -134,10 +143,11 @@ class _Planning(Evidence):
             if not isinstance(spec.table, Table)
         ]
         self.notes: list[str] = []
-        self.budget = max(SECONDS, min(SHARE * self.limit, MOST_SECONDS)) if self.said else SECONDS
+        self.budget = planning_seconds(seconds)
         self.spp: int | None = None
         self.clocks, self.stop = CLOCKS, Event()
         self.spent, self.load, self.known = 0.0, 1.0, 0.0
+        self.began, self.compiling = 0.0, 0.0  # [s] by the clock
         self.ends = self.budget  # of the time that is spent
         self.places: dict[bool, Place] = {}
         self.packings: dict[bool, Packed] = {}
@@ -147,7 +157,7 @@ class _Planning(Evidence):
 
     def plan(self) -> Plan:
         """Return the plan."""
-        began = self.clocks.wall()
+        self.began = self.clocks.wall()
         self.told(0.0, "planning")
         self.look()
         self.refer()
@@ -156,7 +166,7 @@ class _Planning(Evidence):
                 break
             self.add(Candidate(level))
         self.look_deeper()
-        left = max(self.budget - self.spent, LEAST_PILOTS)
+        left = max(self.budget - self.spent, min(LEAST_PILOTS, LEAST_PILOTS / SECONDS * self.budget))
         self.ends = self.spent + left
         self.round(FIRST * left, list(self.pilots))
         self.known = FIRST
@@ -176,9 +186,9 @@ class _Planning(Evidence):
         )  # fmt: skip
         made = Plan(
             self.asked, self.target, self.limit if self.said or beyond else None, (chosen, *rest), far, (),
-            tuple(lacking), tuple(self.notes), self.spent, self.clocks.wall() - began, self.threads, self.load,
-            self.spp, self.drowned(chosen, rest) if beyond else 0.0, 2.0 / max(self.footprint, 1e-6),
-            self.places, self.packings,
+            tuple(lacking), tuple(self.notes), self.spent, self.clocks.wall() - self.began, self.compiling,
+            self.threads, self.load, self.spp, self.drowned(chosen, rest) if beyond else 0.0,
+            2.0 / max(self.footprint, 1e-6), self.places, self.packings,
         )  # fmt: skip
         return replace(made, why=why(made, self.bodies, self.footprint, self.coverage, str(self.reference)))
 
@@ -193,7 +203,7 @@ class _Planning(Evidence):
 
     def unfinished(self, p: Prediction) -> bool:
         """Return whether single grains under small suns are still but bright dots after the time that there is."""
-        return self.rarer > 1.0 and singly(p.candidate) and p.noise(self.able(p)) > UNFINISHED
+        return self.rarer > 1.0 and p.candidate.single and p.noise(self.able(p)) > UNFINISHED
 
     def able(self, p: Prediction) -> float:
         """Return the time that there is [s], or that the samples asked for take."""
@@ -203,7 +213,7 @@ class _Planning(Evidence):
         """Return what is chosen, which a pilot has seen where one can, and all predictions."""
         for looks in range(MOST_CHECKS):
             one = self.choose(self.predictions()).candidate
-            if one in self.pilots or (looks and self.spent > self.ends) or self.stopped():
+            if one in self.pilots or (looks and self.spent > self.ends + BRIEF) or self.stopped():
                 break
             if self.dear and LEVELS[one.level].traits.packed:
                 if self.possible(one) is not None:
@@ -243,6 +253,8 @@ class _Planning(Evidence):
         if all(medium.inside == "grains" for medium in self.scene.media):
             self.places = dict.fromkeys((False, True), place(self.scene, grains=True))  # one for all levels
         world = build(self.scene, "volume", leap=0.0, places=self.places)
+        if world.empty:
+            self.refuse(world)
         self.bodies = prior.bodies(world, self.tables)
         self.footprint, self.coverage, self.ratio = prior.looks(world)
         self.far = self.ratio > FEWER
@@ -258,19 +270,30 @@ class _Planning(Evidence):
             )
         self.spent += self.clocks.process() - began
 
-    def widen(self, sample: float) -> bool:
+    def refuse(self, world: World) -> None:
+        """Leave out levels of single grains, where none fits into a medium: their picture would be empty there."""
+        medium = world.scene.media[world.empty[0] - 1]
+        error = SceneError(
+            f"{world.scene.name}: {called('medium', world.empty[0], medium.name)}: no grain of diameter "
+            f"{2.0 * medium.radius:g} fits into it, so that single grains are not there and a picture of them is empty"
+        )
+        self.impossible |= {name: error for name, one in LEVELS.items() if one.traits.packed or one.traits.remembers}
+
+    def widen(self, sample: float, measured: bool = False) -> bool:
         """Have pilots look at suns that single grains meet often enough to tell what other levels miss, where a sample
-        takes one thread so long [s]; return whether that changes any."""
+        takes one thread so long [s]; return whether that changes any. Only what is measured makes them narrower."""
         samples = OF_REFERENCE * self.budget * self.threads / max(sample, 1e-9)
         share = ENOUGH * MEETINGS / max(samples * self.coverage, 1e-9)  # of the sphere
-        wide = min(max(WIDE, math.degrees(4.0 * math.asin(math.sqrt(min(share, 1.0))))), WIDEST)
+        wide = max(WIDE, math.degrees(4.0 * math.asin(math.sqrt(min(share, 1.0)))))
+        # by steps, so that one scene is planned alike however fast processors are just now
+        wide = min(WIDE * RUNG ** math.ceil(math.log(wide / WIDE, RUNG) - 1e-9), WIDEST)
         lights = tuple(
             replace(light, angular_diameter_deg=wide)
             if isinstance(light, SunLight) and light.angular_diameter_deg < wide
             else light
             for light in self.asked.lights
         )
-        if lights == self.scene.lights or wide < self.wide:
+        if lights == self.scene.lights or (wide < self.wide and not measured):
             return False
         self.wide, self.scene = wide, replace(self.scene, lights=lights)
         self.chance = kurtosis_of(build(self.scene, "volume", leap=0.0, places=self.places).lights)
@@ -329,9 +352,13 @@ class _Planning(Evidence):
         if world is None:
             return False
         pilot = self.pilots[candidate] = Pilot(world, self.seed, self.threads, self.looked_at, self.clocks)
+        if self.reference is not None:
+            pilot.like = self.pilots[self.reference]
         if self.wider:
             pilot.look_wider(MORE)
-        self.pilots[candidate].warm()
+        began = self.clocks.wall()
+        pilot.warm()
+        self.compiling += self.clocks.wall() - began
         return True
 
     def refer(self) -> None:
@@ -359,11 +386,12 @@ class _Planning(Evidence):
             self.notes.append(f"no level explicit here, {self.reference} stands for it: {self.impossible['explicit']}")
 
     def time_the_reference(self) -> None:
-        """See what a sample of single grains takes, and widen suns anew if that is more than was thought."""
-        if self.reference is None or not singly(self.reference) or not self.chance or self.wide >= WIDEST:
+        """See what a sample of single grains takes, and have suns be as wide as that asks, if it is not what was
+        thought: what pilots of wider ones see is carried over to the picture's by a law, and a few glints by chance."""
+        if self.reference is None or not self.reference.single or not self.chance:
             return
         self.round(BEGUN * self.budget, [self.reference])
-        if self.widen(self.pilots[self.reference].seen.seconds):
+        if self.widen(self.pilots[self.reference].seen.seconds, measured=True):
             self.pilots.clear()
             self.add(self.reference)
 
@@ -374,7 +402,7 @@ class _Planning(Evidence):
         best = self.pilots[self.reference]
         if self.trusted(best) or not self.chance or self.often(best, share):
             return
-        aimed = [one for one in self.pilots if not singly(one) and self.trusted(self.pilots[one])]
+        aimed = [one for one in self.pilots if not one.single and self.trusted(self.pilots[one])]
         if aimed:
             self.reference = min(aimed, key=lambda one: list(LEVELS).index(one.level))
 
@@ -385,13 +413,17 @@ class _Planning(Evidence):
 
     def contenders(self) -> list[str]:
         """Return levels that may meet the target, those first of which most is expected."""
-        order = ("teleport-memory", "volume", "teleport-packed", "teleport", "teleport-joint", "volume-hg", "isotropic")
+        order = ["teleport-memory", "volume", "teleport-packed", "teleport", "teleport-joint", "volume-hg", "isotropic"]
+        aim = bool(self.chance and self.atoms)  # whether what aims all of its light is to be seen before time is up
+        if aim:
+            order.sort(key=lambda level: level != "teleport-memory" and not LEVELS[level].traits.points)
         found: list[str] = []
         for level in order if self.bodies else ():
             one = self.expected[level]
             reach = one.floor * math.exp(-OUT * one.spread)
             chain = LEVELS[level].traits.chains  # with explicit grains first its texture goes
-            if Candidate(level) not in self.pilots and (chain or reach < self.target or not self.deep):
+            wanted = chain or reach < self.target or not self.deep or (aim and LEVELS[level].traits.points)
+            if Candidate(level) not in self.pilots and wanted:
                 found.append(level)
         if "teleport-memory" in found and all(table.memory for table in self.tables):
             found = [level for level in found if level not in ("teleport-joint",)]
@@ -443,8 +475,13 @@ class _Planning(Evidence):
         self.told(self.known, word)
 
     def stopped(self) -> bool:
-        """Return whether somebody wants the plan as it is, and there is one."""
-        return self.known > 0.0 and self.stop.is_set()
+        """Return whether somebody wants the plan as it is, or the clock does, and there is one."""
+        return self.known > 0.0 and (self.stop.is_set() or self.late)
+
+    @property
+    def late(self) -> bool:
+        """Whether as much of the time that the picture may take has gone by on the clock as planning may have of it."""
+        return self.said and self.clocks.wall() - self.began - self.compiling > MOST_SHARE * self.limit
 
     def weigh(self) -> None:
         """See how much longer things take than they would if processors had nothing else to do."""
@@ -452,10 +489,15 @@ class _Planning(Evidence):
         self.load = max(1.0, sum(pilot.wall for pilot in self.pilots.values()) / max(busy, 1e-9))
         if self.load > BUSY:
             self.notes.append(
-                f"processors are busy with other things: now everything takes {self.load:.1f} times as long"
+                f"processors are busy with other things: now everything takes {self.load:.1f} times as long; in the "
+                'table "idle" is without that, "busy" with it'
             )
-        if self.stopped():
+        if self.known > 0.0 and self.stop.is_set():
             self.notes.append("planning was interrupted: this is what pilots had seen by then")
+        elif self.late:
+            self.notes.append(
+                f"planning was cut short after a third of the {self.limit:.3g} s: this is what pilots had seen by then"
+            )
         assert self.reference is not None
         if not any(pilot.seen.mean > 0.0 for pilot in self.pilots.values()):
             self.notes.append("no pilot has seen any light: nothing is known of noise, and errors are expected ones")
@@ -479,8 +521,13 @@ class _Planning(Evidence):
         found = self.predictions()
         best = min(p.safe_seconds(self.target) for p in found)
         may = sorted((p for p in found if self.hopeful(p) <= NEAR * best), key=self.hopeful)
-        first = []
-        for p in may[: 0 if self.stopped() else MOST_FINALISTS]:
+        first: list[Candidate] = []
+        for p in may:
+            if len(first) == MOST_FINALISTS or self.stopped():
+                break
+            k = p.candidate.explicit_grains
+            if k and any(one.explicit_grains == k for one in first):  # what one chain misses then all do
+                continue
             if p.candidate in self.pilots or (self.spent < LATEST * self.budget and self.add(p.candidate)):
                 first.append(p.candidate)
         return first
@@ -503,7 +550,7 @@ class _Planning(Evidence):
             enough = max(self.target, TIE * min(after[p.candidate] for p in aimed))
             alike = [p for p in aimed if after[p.candidate] <= enough] or aimed  # of pilots without light
             fit = [p for p in alike if p.floor.high < self.target]
-            return min(fit, key=lambda p: p.turn) if fit else min(alike, key=lambda p: p.floor.high)
+            return min(fit, key=lambda p: p.turn) if fit else safest(alike, lambda p: p.floor.high)
         best = min(found, key=lambda p: p.safe_seconds(self.target))
         takes = best.safe_seconds(self.target)
         limit = self.limit / self.load
@@ -512,11 +559,21 @@ class _Planning(Evidence):
             aimed = [p for p in found if not self.unfinished(p)] or found
             least = min(p.likely_error(limit) for p in aimed)
             alike = [p for p in aimed if p.likely_error(limit) <= TIE * least] or aimed  # of pilots without light
-            return min(alike, key=lambda p: math.hypot(p.bias, p.bias_error, p.noise(limit)))
+            return safest(alike, lambda p: math.hypot(p.bias, p.bias_error, p.noise(limit)))
         if math.isinf(takes):
-            return min(found, key=lambda p: p.floor.high)
+            return safest(found, lambda p: p.floor.high)
         alike = [p for p in found if p.safe_seconds(self.target) <= TIE * takes]
         return min(alike, key=lambda p: p.floor.high)
+
+
+def safest(some: Sequence[Prediction], error: Callable[[Prediction], float]) -> Prediction:
+    """Return the one with the least error; of those that have as little as can be told, that which models most."""
+    least = TIE * min(error(p) for p in some)
+    order = list(LEVELS)
+    return min(
+        (p for p in some if not error(p) > least),  # of pilots without light nothing is
+        key=lambda p: (order.index(p.candidate.level), -p.candidate.explicit_grains),
+    )
 
 
 def loaded(scene: Scene) -> tuple[Scene, list[Table]]:

@@ -11,7 +11,7 @@ from tsdf.walk.geometry import Place
 
 TIE = 1.1  # times as long as the cheapest as it may take, of those the one with the least error is taken
 
-
+UNFINISHED = 0.5  # [1] noise of pixels over their mean, above which single grains under small suns are but bright dots
 BLOCK = 16  # pixels across, of whose means the error is said where that of a pixel says little
 
 
@@ -102,6 +102,8 @@ class Plan:
         and records, and pilots; machine code is not counted [s].
     clock : float
         Time that it took by the clock, everything counted [s].
+    compiling : float
+        What of this machine code took that was made for the first time [s].
     threads : int
     load : float
         How many times as long things take now as they would if processors had nothing else to do.
@@ -126,6 +128,7 @@ class Plan:
     notes: tuple[str, ...]
     spent: float
     clock: float
+    compiling: float
     threads: int
     load: float = 1.0
     spp: int | None = None

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tsdf.plan.prediction import BLOCK, TIE, Plan, Prediction
+from tsdf.plan.prediction import BLOCK, TIE, UNFINISHED, Plan, Prediction
 from tsdf.plan.prior import Body
 
 TARGETS = np.geomspace(0.002, 0.5, 120)  # [1] that are tried for what would change a plan's mind
@@ -26,16 +26,31 @@ def short(prediction: Prediction) -> str:
     if not p.floor.high:
         return f"{p.candidate} has neither bias nor missing texture"
     return (
-        f"{p.candidate} has a bias of {percent(p.bias)} ± {percent(p.bias_error)} and misses texture of "
-        f"{percent(p.texture)} ± {percent(p.texture_error)}"
+        f"{p.candidate} has a bias of {within(p.bias, p.bias_error)} % and misses texture of "
+        f"{within(p.texture, p.texture_error)} %"
     )
 
 
 def percent(value: float) -> str:
     """Return a share in per cent with two digits."""
-    if not math.isfinite(value):
+    return f"{digits(100.0 * value)} %" if math.isfinite(value) else "not known"
+
+
+def within(value: float, error: float) -> str:
+    """Return a share and its error in per cent, of as many digits as the error allows: two of its own, but no more than
+    three behind the point."""
+    value, error = 100.0 * value, 100.0 * error
+    if not (math.isfinite(value) and math.isfinite(error)):
         return "not known"
-    return f"{100.0 * value:.2g} %" if abs(value) < 0.995 else f"{100.0 * value:.0f} %"
+    if not error > 0.0:
+        return f"{digits(value)} ± 0"
+    last = min(1 - math.floor(math.log10(error)), 3)  # digit behind the point
+    return f"{_rounded(value, last)} ± {_rounded(error, last)}"
+
+
+def _rounded(number: float, last: int) -> str:
+    number = round(number, last) + 0.0  # no -0
+    return f"{number:.{max(last, 0)}f}"
 
 
 def digits(number: float) -> str:
@@ -78,7 +93,7 @@ def _first(plan: Plan) -> str:
             met += "single grains, which meet suns by chance, would be mostly noise until "
             met += f"{span(plan.glints)}, so their glints are left out"
         else:
-            met += "none that was looked at is likely to have a tenth less"
+            met += "no other that was looked at is likely to have a tenth less"
         if takes <= plan.able:
             met = f"{percent(plan.target)} after {_about(takes)}"
     elif math.isinf(takes):
@@ -91,7 +106,7 @@ def _first(plan: Plan) -> str:
             f"; that is of a pixel over the mean of the picture, means of {BLOCK} by {BLOCK} pixels are off by {blocks}"
         )
     if p.floor.error > p.floor.value > plan.target:
-        met += f"; {percent(p.floor.value)} ± {percent(p.floor.error)} of it is expected, not measured"
+        met += f"; {within(p.floor.value, p.floor.error)} % of it is expected, not measured"
     return f"take {p.candidate}{far}: {after} ({met})"
 
 
@@ -124,8 +139,9 @@ def _reason(plan: Plan, bodies: Sequence[Body], footprint: float, coverage: floa
     seen = f"a pixel covers {footprint:.2g} R of grains" if math.isfinite(footprint) else "it sees no grains,"
     many = digits(body.thickness / body.transport)
     thick = f"{digits(body.thickness)} R or {many} transport length{'s' * (many != '1')}"
-    which = f" in the thickest of {len(bodies)} media" if len(bodies) > 1 else ""
-    where = f"{seen} that fill {100.0 * body.packing_fraction:.3g} % of {thick}{which}"
+    which = f", the thickest of {len(bodies)}" if len(bodies) > 1 else ""
+    of = f"{100.0 * body.packing_fraction:.3g} % of a body{which}, 2 V/S = {thick}"
+    where = f"{seen} that fill {of}"
     turn = chosen.variance * chosen.turn
     worse = [p for p in plan.predictions[1:] if p.variance * p.turn < turn and p.floor.high > 0.0]
     nearest = min(worse, key=lambda p: p.floor.value, default=None)
@@ -166,29 +182,34 @@ def _other(plan: Plan) -> str:
 def _short_of_time(plan: Plan, able: float) -> str:
     assert plan.seconds is not None
     known = [p for p in plan.predictions[1:] if math.isfinite(p.variance)] or plan.predictions[1:]
-    second = min(known, key=lambda p: p.likely_error(able))
+    done = [p for p in known if not (plan.glints and p.candidate.single and p.noise(able) > UNFINISHED)] or known
+    second = min(done, key=lambda p: p.likely_error(able))
+    alike = math.hypot(plan.chosen.floor.error, second.floor.error)
     runner = f"runner-up: {second.candidate}, an error of {percent(second.error(able))} then"
+    if abs(second.error(able) - plan.chosen.error(able)) < alike:
+        runner += ", which is the same as far as can be told"
     best = min(plan.predictions, key=lambda p: p.safe_seconds(plan.target))
     takes = best.safe_seconds(plan.target) * plan.load
     if not math.isfinite(takes):
         return f"{runner}; no time is known to be enough for {percent(plan.target)}"
-    more = f"{best.candidate} and {span(takes)} instead of {span(plan.seconds)}"
+    busy = " on processors as busy as now" if plan.load >= BUSY else ""
+    more = f"{best.candidate} and {span(takes)} instead of {span(plan.seconds)}{busy}"
     return f"{runner}; {percent(plan.target)} would take {more}"
 
 
 def table(plan: Plan) -> list[str]:
     """Return a table of all candidates as lines of text."""
     after = plan.able
-    free, now = ("", "") if plan.load < BUSY else (", free", ", busy")  # processors
+    free, now = ("", "") if plan.load < BUSY else (", idle", ", busy")  # processors
     head = ["candidate", "bias %", "texture %", "error at best %", f"time to {percent(plan.target)}{free}"]
     head += [f"error after {span(plan.seconds)}{now}"] if plan.seconds is not None else []
     rows = [[*head, "by"]]
     for p in plan.predictions:
         row = [
             str(p.candidate),
-            f"{100 * p.bias:+.2f} ± {100 * p.bias_error:.2f}",
-            f"{100 * p.texture:.2f} ± {100 * p.texture_error:.2f}",
-            f"{100 * p.floor.value:.2f} ± {100 * p.floor.error:.2f}",
+            within(p.bias, p.bias_error),
+            within(p.texture, p.texture_error),
+            within(p.floor.value, p.floor.error),
             _when(p, plan.target),
         ]
         row += [percent(p.error(after))] if after is not None else []

@@ -5,6 +5,7 @@ Level "auto" is a plan: here it becomes a level, explicit grains before it, and 
 
 import math
 import os
+import time
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -14,12 +15,13 @@ from tsdf.picture import render as pictures
 from tsdf.picture.render import Picture
 from tsdf.picture.world import World, build
 from tsdf.plan import report
-from tsdf.plan.planner import TARGET, plan
+from tsdf.plan.planner import TARGET, plan, planning_seconds
 from tsdf.plan.prediction import Plan
 from tsdf.scene.levels import AUTO
 from tsdf.scene.scene import Scene, load, parse, resized
 from tsdf.scene.specs import SPP
 
+LEAST_LEFT = 0.25  # of the time that is given, for the picture, however long planning took
 BOTH = 2.0**0.5  # times the noise that is asked for, that the whole error may be: no more bias and texture than noise
 
 
@@ -31,6 +33,15 @@ class Choice(NamedTuple):
     seconds: float | None
     target_error: float | None
     plan: Plan | None  # where the level was to be chosen
+    ends: float | None = None  # [s] on `time.perf_counter`, when the time that is given for all of this is over
+
+    @property
+    def left(self) -> float | None:
+        """How long the picture may take now [s]: what planning and making it ready have left of the time, where this
+        is given for all."""
+        if self.ends is None or self.seconds is None:
+            return self.seconds
+        return max(self.ends - time.perf_counter(), LEAST_LEFT * self.seconds)
 
     def world(self, leap: float | None = None, progress: Callable[[float, str], None] | None = None) -> World:
         """Return its scene ready to be rendered, of what the plan has made of it as far as that goes."""
@@ -49,21 +60,25 @@ def chosen(
 
     A stop that is given is obeyed, and the choice is for it; else the scene's samples per pixel are taken, and where it
     says none, `SPP`, or of a plan, as many as make its error `TARGET`, or where that is out of reach its noise half of
-    that, but no more than take `planner.PATIENCE`.
+    that, but no more than take `planner.PATIENCE`. Seconds are for planning and picture together; only machine code
+    that is made for the first time comes on top.
     """
+    began = time.perf_counter()
     level = level or scene.render.level
     if spp is None and seconds is None and target_error is None:
         spp = scene.render.spp or (None if level == AUTO else SPP)
     if level != AUTO:
         return Choice(replace(scene, render=replace(scene.render, level=level)), spp, seconds, target_error, None)
     target = TARGET if target_error is None else BOTH * target_error
-    limit = math.inf if target_error is not None else seconds
+    limit = math.inf if target_error is not None else seconds and seconds - planning_seconds(seconds)
     made = plan(scene, min(target, 0.99), limit, spp, seed, threads, told)
     if target_error is not None:
         made = replace(made, why=(report.to_noise(made, target_error), *made.why[1:]))
     if spp is None and seconds is None and target_error is None:
         target_error, seconds = made.noise, made.seconds
-    return Choice(made.planned, spp, seconds, target_error, made)
+        return Choice(made.planned, spp, seconds, target_error, made)
+    ends = None if seconds is None else began + made.compiling + seconds
+    return Choice(made.planned, spp, seconds, target_error, made, ends)
 
 
 def render(
@@ -90,7 +105,7 @@ def render(
         Samples per pixel; the scene's by default, unless one of the next two says when to stop. Where nothing does, 64,
         or with "auto" as many as make bias, missing texture and noise together 2 % of the picture's mean.
     seconds : float, optional
-        Stop after so long [s]; one sample of each pixel is always taken.
+        Stop after so long [s], planning included; one sample of each pixel is always taken.
     target_error : float, optional
         Stop when `Picture.relative_error` is below this.
     width : int, optional
@@ -137,4 +152,4 @@ def render(
     world = choice.world()
     for note in (*(choice.plan.notes if choice.plan else ()), *world.notes):
         warnings.warn(note, stacklevel=2)
-    return pictures.render(world, choice.spp, choice.seconds, choice.target_error, seed, threads)
+    return pictures.render(world, choice.spp, choice.left, choice.target_error, seed, threads)

@@ -31,6 +31,11 @@ class Candidate(NamedTuple):
     explicit_grains: int = 0
     leap: float | None = None
 
+    @property
+    def single(self) -> bool:
+        """Whether it meets single grains, whose light is met by chance."""
+        return self.explicit_grains > 0 or LEVELS[self.level].traits.packed
+
     def __str__(self) -> str:
         after = f" k={self.explicit_grains}" if self.explicit_grains else ""
         leap = "" if self.leap is None else f" leap={self.leap:g}"

@@ -63,6 +63,7 @@ from tsdf.walk.walker import (
     RAYS,
     TRIES,
     TRUNCATED,
+    UNENDING,
     UNKNOWN,
     WAIT,
     Attenuation,
@@ -699,6 +700,8 @@ def pass_through(world, batch, w, amounts, t_b, t, thick):
     that thick along the ray; return CLEAR if it comes through, else what becomes of it."""
     media, m, end = world.media, w.medium, min(t, t_b)
     if media.traits.packed:
+        if media.free[m] >= UNENDING:  # no grain fits in: lights are aimed at through it
+            return CLEAR
         if w.shadow:
             return ENDED
         w.pdf = -1.0
@@ -833,7 +836,7 @@ def go_to_grain(world, w):
     if it must look, for which the grain is kept if one was found, and that there is none if that is sure."""
     g, m = world.geometry, w.medium
     bound = clearance(g, m, triple(w.p))
-    if not bound > 0.0:
+    if not bound > 0.0 or world.media.free[m] >= UNENDING:
         return CLEAR
     far, end = max(bound, NEXT * world.grains.radius[m]), math.inf
     if g.kind[m] != MESH:

@@ -43,6 +43,7 @@ PATIENCE = 100_000  # steps of a walker before others have their turn
 MAX_EVENTS = 50_000_000  # of one path; only light that nothing lets out comes that far, and it is counted
 DIM = math.log(0.25)  # walkers dimmer than this may end
 FAINT = 0.02  # shadows fainter than this may end
+UNENDING = 1e300  # free path where nothing deflects or no grain is, finite so that 0 of it is 0
 TRIES = 8  # to start a ray off a facet, each twice as far from it
 
 
