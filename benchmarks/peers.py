@@ -331,7 +331,8 @@ class PhotonTracer:
             stand(world.place.room, 0, at, there)
             for sphere in np.flatnonzero(there).tolist():
                 key = np.uint64(explicit.named(grains, 0, i, j, k, sphere))
-                axes = np.array([explicit.turned(key, axis, False) for axis in AXES])
+                x, y, z, w = explicit.rotation(key)
+                axes = np.array([explicit.rotated((x, y, z), w, axis) for axis in AXES])
                 found.append(np.column_stack([radius * axes.T, origin + at[sphere]]))
                 kinds.append(explicit.component_of(grains, 0, len(self.meshes), key))
         return np.array(found, np.float32), np.array(kinds, np.uint32)

@@ -11,6 +11,7 @@ from tsdf.handle import Handle
 from tsdf.picture import render, world
 from tsdf.scene.scene import Absorption, Box, Camera, ConstantLight, GrainSpec, MediumSpec, Scene, SunLight
 from tsdf.spheres.packing import next_sphere
+from tsdf.walk import standing
 from tsdf.walk.explicit import find, sides_of
 from tsdf.walk.geometry import planes_of
 from tsdf.walk.room import stands
@@ -32,8 +33,9 @@ def test_sides(name: str, settings: dict, sides: int) -> None:
 
 
 @pytest.mark.slow
-def test_the_ray_engine_sees_the_same() -> None:
+def test_the_ray_engine_sees_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """Packed salt that absorbs, in a sun: to the last bit as with a ray for each side that is met."""
+    monkeypatch.setattr(standing, "standing", lambda *_: standing.nothing_standing())
     grains = (GrainSpec(SALT, absorption=Absorption("grey", (0.3,))),)
     medium = MediumSpec(Box((-6.0, -6.0, -3.0), (6.0, 6.0, 3.0)), 0.5, 1.0, grains, name="salt")
     lights = (ConstantLight((0.5, 0.6, 0.7)), SunLight((0.3, -0.4, 0.8), (3.0, 3.0, 3.0), 40.0))

@@ -397,7 +397,7 @@ def test_a_shape_alone_is_as_beside_others(shape, level, folder, ball):
     """What is answered on the spot, or in lanes, in one exact shape alone is what looking step by step finds.
 
     A ball too far and small to be met makes it look. Light from one side and a loss in the grains tell where light
-    leaves, and how far it went.
+    leaves, and how far it went. Single grains that stand alone are not looked for along the same steps: to rounding.
     """
     grain = GrainSpec(ball, absorption=Absorption("grey", (0.1,)))
     medium = MediumSpec(shape_of(shape, folder), 0.5, 1.0, (grain,), name="medium", packing_spheres=400)

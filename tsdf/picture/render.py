@@ -23,7 +23,7 @@ from tsdf.handle import Handle
 from tsdf.picture.trust import SHOWN, Moments, Trust, kurtosis_of
 from tsdf.picture.world import World, camera_of, sees
 from tsdf.scene.levels import LEVELS
-from tsdf.walk import lanes, packed, transport
+from tsdf.walk import lanes, packed, standing, transport
 from tsdf.walk import walker as W
 from tsdf.walk.hybrid import ALL
 from tsdf.walk.transport import CameraArrays
@@ -117,7 +117,10 @@ class Walkers:
             self.near = Handle(near._replace(media=world.media._replace(traits=LEVELS["explicit"].traits)))
             self.arrays = Handle(near._replace(geometry=world.brim.arrays))
         self.place, self.brim, self.packed = world.place, world.brim, world.packed
-        self.answered = world.media.traits.answered
+        self.answered, self.standing = world.media.traits.answered, None
+        if world.media.singles and not self.answered and world.scene.media:
+            found = standing.standing(world.packed, world.place, len(world.scene.media[0].grains))
+            self.standing = Handle(found) if found.there else None
         exemplars = len(self.packed.engines)
         self.walkers = [np.zeros(ROOM, W.WALKER) for _ in range(2)]
         self.amounts = [np.zeros((ROOM, world.amounts)) for _ in range(2)]
@@ -131,12 +134,12 @@ class Walkers:
         self.counters = np.zeros(6, np.int64)
         self.asked = np.zeros(W.GRAINS_ASKED + exemplars, np.int64)
         self.spectrum = np.zeros(world.absorption.spectral.shape[1])
-        self.radiance = np.zeros((0, 3))
         self.lanes = self.abreast = None
         if lanes.suited(world.place.arrays, world.media):
             self.lanes = lanes.lanes_of(world.amounts)
             self.abreast = Handle(self.lanes)
-        self.reserve(1)
+        self.radiance = np.zeros((BLOCK, 3))  # more than most need: to lay it out takes as long as 2000 samples
+        self._lay_out()
 
     def reserve(self, samples: int) -> None:
         """Let so many samples have found nothing yet."""
@@ -199,6 +202,8 @@ class Walkers:
         many go on; ``walkers[1]`` then holds what they were, those that have ended as they ended."""
         if self.answered:
             packed.answer(self.arrays, self.batches[0], live)
+        elif self.standing:
+            standing.tour(self.standing, self.near, self.arrays, self.near_batches[0], live)
         transport.advance(self.near, self.arrays, self.near_batches[0], self.batches[0], live)
         live, rays = int(self.asked[W.LIVE]), int(self.asked[W.ASKED])
         if rays:

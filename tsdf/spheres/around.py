@@ -99,7 +99,7 @@ def _wide(packing: Packing) -> tuple[int, np.ndarray, np.ndarray]:
 
 
 @njit(forceinline=True, **KERNEL)
-def _met(block, p, d, least):
+def met(block, p, d, least):
     """Return the bits of about how far it is along d from p to the sphere of a block (4, LANES) that is entered first,
     at `least` or beyond, the last few bits its lane; _NONE if there is none."""
     px, py, pz = np.float32(p[0]), np.float32(p[1]), np.float32(p[2])
@@ -125,7 +125,7 @@ def nearest(around, sphere, n, d):
     for b in range(BLOCKS):
         if around.start[sphere, b] >= best:
             break
-        here = _met(around.spheres[sphere, b], n, d, 0.0)
+        here = met(around.spheres[sphere, b], n, d, 0.0)
         if here < first:
             first, found = here, b * LANES + (here & _LAST)
             best = np.int32(here).view(np.float32)
@@ -161,7 +161,7 @@ def across(around, p, d, start, most):
         )
         best, block = _NONE, -1
         for b in range(around.first[cell], around.first[cell + 1]):
-            here = _met(around.cells[b], p, d, least)
+            here = met(around.cells[b], p, d, least)
             if here < best:
                 best, block = here, b
         after = min(tx, ty, tz)

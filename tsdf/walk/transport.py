@@ -809,11 +809,11 @@ def in_grain(world, batch, w, amounts, facet):
 @njit(**KERNEL)
 def meet_grain(world, batch, w, amounts):
     """Take a walker on in its grain, or ask for the facet that it meets or the record; return what becomes of it."""
-    if world.media.traits.answered:  # by `packed`, between two turns, which may have taken it to its end
-        if w.state & X.LEFT == 0:
-            return WAIT
+    if w.state & X.LEFT:  # `packed` or `standing` have taken it to its end, between two turns
         w.mode = FLY
         return ENDED
+    if world.media.traits.answered:
+        return WAIT
     grains, facet = world.grains, NONE
     e = grains.exemplar[w.component]
     if e != X.EXACT_SPHERE:
