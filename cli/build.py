@@ -374,8 +374,9 @@ def trace(
         part_file.unlink(missing_ok=True)  # a refused grain cannot be gone on with
         raise
     except UsageError as error:
+        other = " instead of --quality" if quality else ""
         raise UsageError(
-            f"{error}; its {build.paths} paths are kept in {plain(part_file)}: --resume goes on with them, "
+            f"{error}{other}; its {build.paths} paths are kept in {plain(part_file)}: --resume goes on with them, "
             "--resume --max-seconds 0 makes the table as good as it got"
         ) from None
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 DEFAULT_RADIUS = "0.5mm"
 QUALITY = "draft"
+FLAT_PATHS = 1_000_000  # of grains for which it is out of reach
 
 
 @click.command("tsdf-preview", cls=Tool)
@@ -114,7 +115,11 @@ def table_of(
     effort = Effort(target_error=draft.target_error, joint=draft.joint, memory=draft.memory)
     optics = optics_of(eta, None if eta is not None else material, None, "un", quiet)
     built_in = shape.kind == "sphere" or not Path(grain).is_file()
-    return build(shape, optics, effort, threads), None if built_in else Path(grain)
+    mesh = None if built_in else Path(grain)
+    try:
+        return build(shape, optics, effort, threads), mesh
+    except UsageError:  # of flat grains no number of cells is enough; a picture is not the place to say so
+        return build(shape, optics, Effort(paths=FLAT_PATHS, joint=draft.joint, memory=draft.memory), threads), mesh
 
 
 def absorption_of(table: "Table", material: str | None, by_hand: tuple[float, ...] | None) -> "Absorption":

@@ -27,8 +27,9 @@ if TYPE_CHECKING:
     from tsdf.picture.render import Picture
     from tsdf.picture.world import World
 
-SPOTTED, OF_DOTS = 0.1, 0.6  # [1] relative error from which on, and share of it of a hundredth of the pixels from which
-# on, noise is said to be bright dots
+SPOTTED, OF_DOTS = 0.1, 0.6  # [1] relative error from which on, and share of it of a hundredth of the lit pixels from
+# which on, noise is said to be bright dots
+LEAST_DOTS = 4  # such pixels
 
 
 def first_grains(
@@ -195,31 +196,47 @@ def summary(world: "World", picture: "Picture", out: Path) -> None:
         f"{picture.seconds:.1f} s, {picture.events / max(picture.seconds, 1e-9):.3g} grain events per second"
     )
     if (dots := fireflies(picture)) is not None:
-        say(f"{plain(out)}: {dots}")
+        say(f"{plain(out)}: {dots}{fewer_dots(world)}")
     for line in media(world):
         say(line)
     lost = picture.truncated + picture.faults
     if lost:
-        click.echo(f"warning: {lost} paths were given up ({picture.faults} of them at a fault of a mesh)", err=True)
+        faults = (
+            f", {picture.faults} of them at a fault of a mesh"
+            if picture.faults
+            else ", after more grains than any other"
+        )
+        click.echo(f"warning: {lost} paths were given up{faults}", err=True)
 
 
 def fireflies(picture: "Picture") -> str | None:
-    """Return what is to be said of a picture whose noise is that of a few bright dots; None of others."""
+    """Return what is to be said of a picture whose noise is that of a few bright dots; None of others, and of those of
+    which too few pixels are lit to tell."""
     import numpy as np
 
-    each = np.sort(np.ravel(picture.variance.mean(axis=2)))
-    whole, mean = float(each.sum()), float(picture.rgb.mean())
-    few = max(each.size // 100, 1)
-    if not (0.0 < whole < math.inf and mean > 0.0 and picture.relative_error > SPOTTED):
+    lit = picture.rgb.mean(axis=2) > 0.0
+    each = np.sort(picture.variance.mean(axis=2)[lit])
+    few = each.size // 100
+    if few < LEAST_DOTS or not SPOTTED < picture.relative_error < math.inf:
         return None
-    share = float(each[-few:].sum()) / whole
+    share, mean = float(each[-few:].sum() / each.sum()), float(picture.rgb[lit].mean())
     if share < OF_DOTS:
         return None
     middle = math.sqrt(float(each[each.size // 2])) / mean
     return (
-        f"its noise is bright dots: 1 % of the pixels make {100.0 * share:.0f} % of it, half of all are off by less "
-        f"than {middle:.2g}; a wider sun has fewer, or a level that aims all light, volume-hg or isotropic"
+        f"its noise is bright dots: 1 % of the lit pixels make {100.0 * share:.0f} % of it, half of them are off by "
+        f"less than {middle:.2g} of their mean"
     )
+
+
+def fewer_dots(world: "World") -> str:
+    """Return what a scene can do about bright dots."""
+    from tsdf.scene.specs import SunLight
+
+    suns = any(isinstance(light, SunLight) for light in world.scene.lights)
+    aims = world.level in ("volume-hg", "isotropic")
+    ways = ["a wider sun"] * suns + ["a level that aims all light, volume-hg or isotropic,"] * (not aims)
+    return f"; {' or '.join(ways)} has fewer" if ways else ""
 
 
 def media(world: "World") -> Iterator[str]:

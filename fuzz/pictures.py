@@ -143,7 +143,7 @@ def wrong_furnace(maker: Maker) -> str:
     scene, level = maker.furnace()
     picture = taken(scene, level, SPP["furnace"], 0)
     off = float(np.abs(picture.rgb - 1.0).max())
-    return f"furnace at {level}: off by {off:.2g}, {lost(picture)} lost" if off > FURNACE or lost(picture) else ""
+    return f"furnace at {level}: off by {off:.2g}, {lost(picture)} lost" if not off <= FURNACE or lost(picture) else ""
 
 
 def wrong_pair(maker: Maker) -> str:
@@ -152,7 +152,7 @@ def wrong_pair(maker: Maker) -> str:
     one, other = (taken(scene, level, SPP["pair"], seed) for seed, scene in enumerate((exact, meshes)))
     error = np.sqrt(sum(p.variance.sum(axis=(0, 1)) for p in (one, other))) / one.samples.size
     off = np.abs(one.rgb.mean(axis=(0, 1)) - other.rgb.mean(axis=(0, 1))) / np.maximum(error, 1e-12)
-    if off.max() > SIGMAS or lost(one) or lost(other):
+    if not off.max() <= SIGMAS or lost(one) or lost(other):
         return f"boxes at {level}: {off.max():.2g} standard errors, {lost(one)} and {lost(other)} lost"
     return ""
 

@@ -1,5 +1,6 @@
 """Machine code that is kept: never stale, never where others can write, and never a reason to stop."""
 
+import gc
 import os
 import shutil
 import subprocess
@@ -171,3 +172,11 @@ def test_a_first_kernel_needs_no_scipy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["2.0", "False", "-0.5", "True"]
+
+
+def test_compiling_is_timed_and_collects_no_less_garbage_afterwards():
+    before, usual = compiled.compiled_for(), gc.get_threshold()
+    compiled.njit()(lambda x: 2.0 * x)(1.0)
+    assert (compiled.compiled_for() > before).all()
+    assert gc.get_threshold() == usual
+    assert not compiled.compiling()

@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 import warnings
 from collections.abc import Callable
 from functools import cache, cached_property
@@ -24,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import caching, cgutils, codegen, compiler, cpu, event, types
 from numba.extending import intrinsic
@@ -224,9 +226,11 @@ class _Compiling(event.Listener):
     """
 
     count = 0
+    took = np.zeros(2)  # [s] so far, by the clock and of processors
 
     def on_start(self, _: Any) -> None:
         if not self.count:
+            self._began = self._clocks()
             self._usual = gc.get_threshold()
             gc.set_threshold(*SELDOM)
         self.count += 1
@@ -235,10 +239,19 @@ class _Compiling(event.Listener):
         self.count -= 1
         if not self.count:
             gc.set_threshold(*self._usual)
+            self.took = self.took + self._clocks() - self._began
+
+    def _clocks(self) -> np.ndarray:
+        return np.array((time.perf_counter(), time.process_time()))
 
 
 _now = _Compiling()
 event.register("numba:compile", _now)
+
+
+def compiled_for() -> np.ndarray:
+    """Return how long kernels have been compiled in this process [s]: by the clock, and of processors."""
+    return _now.took
 
 
 def compiling() -> bool:
@@ -253,7 +266,8 @@ def compile_ahead(kernel: Any, module: str) -> None:
     waits for that process; whatever becomes of it, a kernel that is not kept then is compiled as ever.
     """
     kept = kernel._cache
-    if kept.process is None and (os.cpu_count() or 1) > 1 and kept.missing:
+    allowed = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    if kept.process is None and len(allowed) > 1 and kept.missing:
         command = [sys.executable, "-P", "-m", module]
         quiet = subprocess.DEVNULL
         kept.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet)
@@ -363,8 +377,10 @@ class _Kept:
     def load_overload(self, signature: Any, context: Any) -> Any:
         if self.process is not None and self.process.poll() is None:
             _now.on_start(None)
-            self.process.wait()
-            _now.on_end(None)
+            try:
+                self.process.wait()
+            finally:
+                _now.on_end(None)
         return self._made.load_overload(signature, context)
 
     def __getattr__(self, name: str) -> Any:

@@ -16,9 +16,10 @@ import pytest
 from click.testing import CliRunner, Result
 
 from tsdf.cli import common
-from tsdf.cli.render import main
+from tsdf.cli.render import fireflies, main
 from tsdf.errors import TSDFError
 from tsdf.picture import image
+from tsdf.picture.render import Picture
 from tsdf.plan import shot
 from tsdf.reference_data.make_checks import CHECKS
 
@@ -335,3 +336,22 @@ def test_fewer_far(folder: Path) -> None:
     asked = CliRunner().invoke(main, [str(folder / "far.toml"), "--out", str(folder / "g.exr"), "--quiet"])
     assert asked.exit_code == 0
     np.testing.assert_array_equal(image.read_exr(folder / "f.exr").rgb, image.read_exr(folder / "g.exr").rgb)
+
+
+def dotted(dots: int, lit: int = 2000, noise: float = 0.02) -> Picture:
+    """A picture of `lit` pixels of radiance 1 on black, some of which are far noisier."""
+    rgb, variance = np.zeros((100, 100, 3)), np.zeros((100, 100, 3))
+    rgb.reshape(-1, 3)[:lit], variance.reshape(-1, 3)[:lit] = 1.0, noise**2
+    variance.reshape(-1, 3)[:dots] = 400.0
+    return Picture(rgb, variance, np.full((100, 100), 16), 1, 1, 1.0, 0, 0, False)
+
+
+def test_bright_dots_are_told_from_noise() -> None:
+    """Not even noise is taken for them, nor a small thing on black, nor a few pixels."""
+    assert "1 % of the lit pixels make 100 % of it, half of them are off by less than 0.02" in str(
+        fireflies(dotted(10))
+    )
+    assert fireflies(dotted(0, noise=3.0)) is None
+    assert fireflies(dotted(0, lit=80, noise=3.0)) is None
+    assert fireflies(dotted(1, lit=80)) is None
+    assert fireflies(dotted(200)) is None

@@ -1,6 +1,9 @@
 """Random scenes whose pictures are known are right, and would be found if they were not."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
 
 from fuzz import pictures
 
@@ -28,3 +31,11 @@ def test_a_body_that_absorbs_more_as_a_mesh_is_found(monkeypatch, tmp_path):
     )
     monkeypatch.setattr(maker, "pair", lambda: (exact, replace(meshes, media=more), level))
     assert "standard errors" in pictures.wrong_pair(maker)
+
+
+def test_what_is_not_a_number_is_found(monkeypatch, tmp_path):
+    dark = SimpleNamespace(rgb=np.full((2, 2, 3), np.nan), variance=np.zeros((2, 2, 3)), samples=np.ones((2, 2)),
+                           truncated=0, faults=0)  # fmt: skip
+    monkeypatch.setattr(pictures, "taken", lambda *_: dark)
+    assert pictures.wrong_furnace(pictures.Maker(0, 0, tmp_path))
+    assert pictures.wrong_pair(pictures.Maker(0, 0, tmp_path))

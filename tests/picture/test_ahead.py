@@ -22,7 +22,7 @@ def begun(monkeypatch):
     kept = transport.advance._cache
     monkeypatch.setattr(kept, "process", None)
     monkeypatch.setattr(type(kept), "missing", True)
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1}, raising=False)
     ahead.begin()
     with kept.process as process:
         yield kept

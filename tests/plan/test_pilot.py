@@ -3,6 +3,7 @@
 import math
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -90,6 +91,7 @@ def test_the_first_sample_of_a_pixel_takes_longer(slab: Scene) -> None:
     assert short.sample_seconds == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_pilots_take_what_pictures_take(slab: Scene) -> None:
     """A sample of a pilot and one of a picture of the same pixels take one thread as long, within a factor of 2 on a
     busy machine; of portions of one sample alone it would be more."""
@@ -130,6 +132,15 @@ def test_seconds_are_for_planning_and_picture() -> None:
     choice = shot.Choice(None, None, 60.0, None, None, now + 41.0)  # type: ignore[arg-type]
     assert choice.left == pytest.approx(41.0, abs=1.0)
     assert choice._replace(ends=now - 5.0).left == 15.0 and choice._replace(ends=None).left == 60.0
+
+
+def test_a_third_of_the_seconds_for_both_is_planned(slab: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 9 s for planning and picture 3 are planned at most, and the picture has 6."""
+    made: list[Any] = []
+    monkeypatch.setattr(planner._Planning, "plan", lambda self: made.append(self))
+    planner.plan(slab, seconds=9.0, together=True)
+    planner.plan(slab, seconds=9.0)
+    assert [(run.budget, run.limit, run.whole) for run in made] == [(3.0, 6.0, 9.0), (3.0, 9.0, 9.0)]
 
 
 def test_numbers_have_the_digits_that_errors_allow() -> None:

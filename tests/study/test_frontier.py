@@ -287,7 +287,8 @@ def test_no_level_that_meets_a_small_sun_by_chance_is_believed(ball: Scene, monk
     assert made is not None and made.truth == "teleport-memory"
     assert [str(row.candidate) for row in made.rows] == ["teleport", "volume"]
     left = [note for note in made.notes if note.startswith("left out: ")]
-    assert len(left) == 1 and left[0].startswith("left out: explicit, teleport-packed, teleport k=2: ")
+    assert len(left) == 2 and left[0].startswith("left out: explicit, teleport-packed: as the truth: ")
+    assert left[1].startswith("left out: explicit, teleport k=2: ")
     assert not any(note.startswith("ball: level explicit meets") for note in made.notes)
     wide = frontier.measure(under(60.0), chosen, runs=2, threads=1)
     assert wide is not None and wide.truth == "explicit" and len(wide.rows) == len(chosen)

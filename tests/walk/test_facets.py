@@ -93,3 +93,13 @@ def test_exemplars_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
         assert np.array_equal(asked(own, united, starts, ways, e), np.where(alone < 0, -1, alone + first[e]))
     monkeypatch.setattr(facets, "MOST_FACETS", len(corners[0]) - 1)
     assert facets_of([corners[0]], [0]).where.tolist() == [-1]
+
+
+def test_a_cell_of_too_many_facets_is_left_to_the_ray_engine() -> None:
+    """A tiny ball of 81,920 facets beside a large one, all in one cell, which holds 65,280 at most; one of 20,480 is
+    found."""
+    large = load_grain("icosphere", subdivisions=4)
+    for subdivisions, there in ((6, 0), (7, -1)):
+        small = load_grain("icosphere", subdivisions=subdivisions)
+        both = np.concatenate((corners_of(large), 0.004 * corners_of(small) + (0.3, 0.2, 0.1)))
+        assert facets_of([both], [0]).where.tolist() == [there]

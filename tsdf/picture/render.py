@@ -18,10 +18,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tsdf.errors import SceneError, UsageError
+from tsdf.compiled import compiled_for
+from tsdf.errors import UsageError
 from tsdf.handle import Handle
 from tsdf.picture.trust import SHOWN, Moments, Trust, kurtosis_of
-from tsdf.picture.world import World, camera_of, sees
+from tsdf.picture.world import World, camera_of, check_seen
 from tsdf.scene.levels import LEVELS
 from tsdf.walk import lanes, packed, standing, transport
 from tsdf.walk import walker as W
@@ -251,10 +252,7 @@ def render(
         Set by others to end early; the picture then holds the samples so far.
     """
     camera = world.scene.camera
-    if not sees(world):
-        raise SceneError(
-            f"{world.scene.name}: a camera looking at nothing: it sees neither a medium nor a surface; move its target"
-        )
+    check_seen(world)
     return measure(
         world, camera_of(world), camera.width, camera.height, spp, seconds, target_error, seed, threads, progress, stop,
         world.met,
@@ -286,7 +284,7 @@ def measure(
     for walkers in pool:
         walkers.counters[:] = 0
     free, least = list(pool), LEAST if pool[0].lanes is None else LEAST_IN_LANES
-    begin, worked = time.perf_counter(), time.process_time()
+    begin, worked, before = time.perf_counter(), time.process_time(), compiled_for()
 
     def follow(block: Portion) -> np.ndarray:
         mine = free.pop()
@@ -297,11 +295,11 @@ def measure(
             free.append(mine)
 
     def spent() -> float:
-        return time.perf_counter() - begin
+        return time.perf_counter() - begin - float(compiled_for()[0] - before[0])  # what lanes hand over is rare
 
     def picture(interrupted: bool) -> Picture:
         made = sums.picture(np.sum([walkers.counters for walkers in pool], axis=0), spent(), interrupted)
-        return replace(made, processor_seconds=time.process_time() - worked)
+        return replace(made, processor_seconds=time.process_time() - worked - float(compiled_for()[1] - before[1]))
 
     done, share, took, reached, chance = 0, 0, 0.0, math.inf, 0.0
     with ThreadPoolExecutor(threads) as executor:

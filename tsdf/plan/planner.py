@@ -14,7 +14,7 @@ from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
 from tsdf.errors import SceneError, UsageError
 from tsdf.picture.trust import kurtosis_of
-from tsdf.picture.world import World, build
+from tsdf.picture.world import World, build, check_seen
 from tsdf.plan import needs, prior
 from tsdf.plan.evidence import BOLD, BOLD_BIAS, GRAINS, MEETINGS, Evidence
 from tsdf.plan.pilot import CLOCKS, FEWEST, HALVES, MORE, PIXELS, Clocks, Pilot
@@ -83,7 +83,7 @@ def checked_target(target: float, name: str = "target") -> float:
 def plan(
     scene: Scene, target: float = TARGET, seconds: float | None = None, spp: int | None = None, seed: int | None = None,
     threads: int | None = None, told: Callable[[float, str], None] | None = None, stop: Event | None = None,
-    clocks: Clocks | None = None,
+    clocks: Clocks | None = None, together: bool = False,
 ) -> Plan:  # fmt: skip
     """Return how a scene is best rendered.
 
@@ -109,6 +109,8 @@ def plan(
         Set by others to end early; the plan is then what is known so far.
     clocks : Clocks, optional
         What time is read from; others than the machine's make plans that can be made again to the last bit.
+    together : bool
+        Whether `seconds` are for planning and picture together, and not for the picture alone.
 
     Raises
     ------
@@ -123,6 +125,8 @@ def plan(
     run = _Planning(scene, target, seconds, scene.render.seed if seed is None else seed, threads or os.cpu_count() or 1)
     run.spp, run.clocks, run.stop = spp, clocks or CLOCKS, stop or Event()
     run.told = told or (lambda share, word: None)
+    if together:
+        run.limit -= planning_seconds(seconds)
     return run.plan()
 
 
@@ -132,7 +136,7 @@ class _Planning(Evidence):
     def __init__(self, scene: Scene, target: float, seconds: float | None, seed: int, threads: int) -> None:
         super().__init__(scene.camera.width * scene.camera.height, threads)
         self.asked, self.target, self.seed = scene, target, seed
-        self.limit = PATIENCE if seconds is None else seconds
+        self.limit = self.whole = PATIENCE if seconds is None else seconds
         self.said = seconds is not None and math.isfinite(seconds)  # whether that long is meant, and not at most
         self.told: Callable[[float, str], None] = lambda share, word: None
         self.scene, self.tables = loaded(scene)  # as pilots see it
@@ -253,6 +257,7 @@ class _Planning(Evidence):
         if all(medium.inside == "grains" for medium in self.scene.media):
             self.places = dict.fromkeys((False, True), place(self.scene, grains=True))  # one for all levels
         world = build(self.scene, "volume", leap=0.0, places=self.places)
+        check_seen(world)
         if world.empty:
             self.refuse(world)
         self.bodies = prior.bodies(world, self.tables)
@@ -481,7 +486,7 @@ class _Planning(Evidence):
     @property
     def late(self) -> bool:
         """Whether as much of the time that the picture may take has gone by on the clock as planning may have of it."""
-        return self.said and self.clocks.wall() - self.began - self.compiling > MOST_SHARE * self.limit
+        return self.said and self.clocks.wall() - self.began - self.compiling > MOST_SHARE * self.whole
 
     def weigh(self) -> None:
         """See how much longer things take than they would if processors had nothing else to do."""
@@ -496,7 +501,7 @@ class _Planning(Evidence):
             self.notes.append("planning was interrupted: this is what pilots had seen by then")
         elif self.late:
             self.notes.append(
-                f"planning was cut short after a third of the {self.limit:.3g} s: this is what pilots had seen by then"
+                f"planning was cut short after a third of the {self.whole:.3g} s: this is what pilots had seen by then"
             )
         assert self.reference is not None
         if not any(pilot.seen.mean > 0.0 for pilot in self.pilots.values()):
@@ -544,6 +549,8 @@ class _Planning(Evidence):
         noise is about the least, or small enough, and that miss less than the target. None is taken of whose noise
         nothing is known, unless nothing is of any."""
         found = [p for p in found if math.isfinite(p.variance)] or found
+        if self.dear:  # what few samples have told of paths that long is not what they take
+            found = [p for p in found if not LEVELS[p.candidate.level].traits.answered] or found
         if self.spp is not None:
             after = {p.candidate: p.likely_error(self.able(p)) for p in found}
             aimed = [p for p in found if not self.unfinished(p)] or found
@@ -556,7 +563,8 @@ class _Planning(Evidence):
         limit = self.limit / self.load
         if not takes <= limit and math.isfinite(limit):
             # sparkle that is not rendered to the end is nothing but noise; and what all miss tells none from the others
-            aimed = [p for p in found if not self.unfinished(p)] or found
+            aimed = [p for p in found if not self.unfinished(p) and p.turn <= limit]
+            aimed = aimed or [p for p in found if not self.unfinished(p)] or found
             least = min(p.likely_error(limit) for p in aimed)
             alike = [p for p in aimed if p.likely_error(limit) <= TIE * least] or aimed  # of pilots without light
             return safest(alike, lambda p: math.hypot(p.bias, p.bias_error, p.noise(limit)))

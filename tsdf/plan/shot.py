@@ -15,7 +15,7 @@ from tsdf.picture import render as pictures
 from tsdf.picture.render import Picture
 from tsdf.picture.world import World, build
 from tsdf.plan import report
-from tsdf.plan.planner import TARGET, plan, planning_seconds
+from tsdf.plan.planner import TARGET, plan
 from tsdf.plan.prediction import Plan
 from tsdf.scene.levels import AUTO
 from tsdf.scene.scene import Scene, load, parse, resized
@@ -70,8 +70,8 @@ def chosen(
     if level != AUTO:
         return Choice(replace(scene, render=replace(scene.render, level=level)), spp, seconds, target_error, None)
     target = TARGET if target_error is None else BOTH * target_error
-    limit = math.inf if target_error is not None else seconds and seconds - planning_seconds(seconds)
-    made = plan(scene, min(target, 0.99), limit, spp, seed, threads, told)
+    limit, together = math.inf if target_error is not None else seconds, target_error is None and seconds is not None
+    made = plan(scene, min(target, 0.99), limit, spp, seed, threads, told, together=together)
     if target_error is not None:
         made = replace(made, why=(report.to_noise(made, target_error), *made.why[1:]))
     if spp is None and seconds is None and target_error is None:

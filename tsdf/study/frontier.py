@@ -38,6 +38,7 @@ TRUTH = 0.45  # share of the time for the truth, which all candidates are measur
 LEAST_RUNS, MOST_RUNS = 2, 1000
 TRIAL = 0.1  # share of a run's time after which a trial says how many samples it can have
 DOUBLINGS = 4  # of the samples of a run, at which its error is measured
+TRUE = 100.0  # times as often as others the truth is to meet lights, if by chance alone: its noise is in all errors
 LEAST_SAMPLES = 2  # of a pixel, for one has no variance
 MOST_PIXELS = 20_000_000  # of all pictures, which are in memory until the end: a gigabyte
 MEETINGS = 1.0 / SHOWN  # of lights that only chance finds, below which a picture of them is not believed
@@ -335,14 +336,14 @@ class Sizing:
         """Return how many samples of a pixel fit into a share of a run."""
         return _affordable(world, share * self.seconds, self.seed, self.threads, self.stop)
 
-    def blind(self, world: World, samples: int) -> bool:
+    def blind(self, world: World, samples: int, meetings: float = MEETINGS) -> bool:
         """Return whether all runs together meet suns and small bright lights too seldom, for a world that finds them by
         chance alone."""
         if not (world.media.singles and world.scene.media and world.lights.sampled) or self.stop.is_set():
             return False
         camera = world.scene.camera
         met = samples * self.runs * camera.width * camera.height / kurtosis_of(world.lights)
-        return met < MEETINGS
+        return met < meetings
 
 
 class Left(dict[str, list[str]]):
@@ -375,8 +376,9 @@ def truth_of(scene: Scene, sized: Sizing, left: Left) -> Way:
             failed = failed or error
             left.add(str(error), str(candidate))
             continue
-        if sized.blind(world, LEAST_SAMPLES) and sized.blind(world, sized.of(world, TRUTH)):
-            left.add(BLIND, str(candidate))
+        few = TRUE * MEETINGS
+        if sized.blind(world, LEAST_SAMPLES, few) and sized.blind(world, sized.of(world, TRUTH), few):
+            left.add(f"as the truth: suns and small lights would be met by less than {few:.0f} paths", str(candidate))
             continue
         return Way(candidate, world, 0)
     raise failed or UsageError(f"{scene.name}: {BLIND}")

@@ -192,9 +192,9 @@ def _parted(middles, listed, first, blocks, lanes):
             waiting += 2
 
 
-def _sorted(corners: np.ndarray) -> tuple[Lots, np.ndarray, np.ndarray, np.ndarray]:
+def _sorted(corners: np.ndarray) -> tuple[Lots, np.ndarray, np.ndarray, np.ndarray] | None:
     """Return the cells of triangles (f, 3, 3), the triangle (blocks, LANES) of each lane, -1 for none, the boxes of the
-    blocks and the first of each group."""
+    blocks and the first of each group; None where a cell has too many."""
     low, high = corners.min(axis=(0, 1)) - 10.0 * PAD, corners.max(axis=(0, 1)) + 10.0 * PAD
     edge = max(float((high - low).max()) / MOST_CELLS, float(np.sqrt(8.0 * PER_CELL / len(corners))))
     counts = np.maximum(np.ceil((high - low) / edge), 1.0).astype(np.int64)
@@ -204,6 +204,9 @@ def _sorted(corners: np.ndarray) -> tuple[Lots, np.ndarray, np.ndarray, np.ndarr
     listed = np.zeros(int(first[-1]), np.int64)
     _listed(corners, low, edge, counts, first, listed)
     blocks = -(-np.diff(first) // LANES)
+    groups = -(-blocks // LANES)
+    if groups.max() > MOST_BLOCKS:
+        return None
     lanes = np.full((int(blocks.sum()), LANES), -1)
     _parted(corners.mean(axis=1), listed, first, blocks, lanes)
     own = np.where(lanes >= 0, lanes, lanes[:, :1])
@@ -211,7 +214,6 @@ def _sorted(corners: np.ndarray) -> tuple[Lots, np.ndarray, np.ndarray, np.ndarr
     cell = np.repeat(np.arange(len(blocks)), blocks)
     at = low + edge * np.stack(np.unravel_index(cell, counts), axis=1)
     ends = np.maximum(ends[0], at - PAD), np.minimum(ends[1], at + edge + PAD)
-    groups = -(-blocks // LANES)
     place = np.arange(len(cell)) - (np.cumsum(blocks) - blocks)[cell]
     group = (np.cumsum(groups) - groups)[cell] + place // LANES
     boxes = np.empty((int(groups.sum()), 6, LANES), np.float32)
@@ -241,9 +243,10 @@ def facets_of(meshes: list[np.ndarray | None], first_facet: list[int]) -> Facets
         where.append(-1)
         if corners is None or not 0 < len(corners) <= MOST_FACETS:
             continue
-        own, lanes, box, start = _sorted(corners)
-        if (np.maximum(own.lot, 0) & MOST_BLOCKS).max() == MOST_BLOCKS or groups + len(box) >= MOST_ALL:
+        found = _sorted(corners)
+        if found is None or groups + len(found[2]) >= MOST_ALL:
             continue
+        own, lanes, box, start = found
         block = np.full((len(lanes), 10, LANES), np.nan, np.float32)
         block[:, :9] = np.where(lanes[..., None] >= 0, corners.reshape(-1, 9)[lanes], np.nan).swapaxes(1, 2)
         block[:, 9] = np.maximum(lanes + first, 0).astype(np.int32).view(np.float32)

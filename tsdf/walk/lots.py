@@ -115,10 +115,11 @@ def outside(lots, g):
 
 
 def lots_of(low: np.ndarray, per_edge: float, counts: np.ndarray, blocks: np.ndarray) -> Lots:
-    """Return the cells of a grid that have so many blocks (cells,) each, one after the other."""
+    """Return the cells of a grid that have so many blocks (cells,) each, MOST_BLOCKS at most, one after the other."""
     from scipy.ndimage import distance_transform_cdt
 
     far = distance_transform_cdt((blocks == 0).reshape(counts), metric="chessboard").reshape(-1)
+    assert blocks.max() <= MOST_BLOCKS
     first = np.cumsum(blocks) - blocks
     if not (blocks > 0).any():  # then it is nowhere
         far = np.full(len(blocks), int(counts.max()))

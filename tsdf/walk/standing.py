@@ -28,6 +28,7 @@ from tsdf.walk.transport import in_grain
 from tsdf.walk.walker import ENDED, FLY, GRAIN, HANDED, JUMP, LOOK, NONE, PATIENCE, find, write
 
 MOST = 200_000  # grains; more are asked of the packing, which needs no room for each
+MOST_TILES = 10_000  # of the packing, a third of a second
 MOST_CELLS = 2_000_000
 PAD = 1e-3  # [R] cells list spheres that come this close, far more than the rounding of float32
 FAR = 1e6  # [R] where lanes without a sphere have theirs
@@ -230,6 +231,8 @@ def standing_of(grains: X.Grains, place: Place, kinds: int) -> Standing:
         return nothing_standing()
     room, tiles, spheres, found = Handle(place.room), [], [], []
     every = [range(math.floor(a), math.floor(b) + 1) for a, b in zip(low / side, high / side, strict=True)]
+    if math.prod(map(len, every)) > MOST_TILES:
+        return nothing_standing()
     there = np.zeros(len(centres), np.uint8)
     for tile in itertools.product(*every):
         own = centres + side * np.array(tile)

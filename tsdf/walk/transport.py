@@ -376,7 +376,7 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
                 if wait == ENDS:
                     state = ENDED
                     break
-                bound, most = bound_there, min(most, steps + media.limit - w.events)
+                bound, most = bound_there, min(most, media.limit - w.events + leapt)
                 continue
 
         c = first
