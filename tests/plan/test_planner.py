@@ -183,7 +183,7 @@ def test_a_small_sun_is_left_to_levels_that_aim_at_it(ball: tsdf.Table, sky: flo
     assert report.table(made)[1].startswith(str(one)) and made.scene.lights == lights
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("warnings.warn", lambda *_, **__: None)
-        patch.setattr(shot, "plan", lambda *_: made)
+        patch.setattr(shot, "plan", lambda *_, **__: made)
         found = tsdf.render(scene, target_error=0.1, threads=2)
         wide = replace(scene, lights=(replace(SUN, angular_diameter_deg=15.0), *lights[1:]))
         truth = tsdf.render(wide, "explicit", spp=1500, threads=2)
@@ -283,7 +283,7 @@ def test_auto_in_python(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> No
     choice = shot.chosen(scene, spp=3, threads=2)
     assert choice.plan is not None and (choice.spp, choice.target_error) == (3, None)
     found = choice.scene.render
-    monkeypatch.setattr(shot, "plan", lambda *_: choice.plan)
+    monkeypatch.setattr(shot, "plan", lambda *_, **__: choice.plan)
     assert choice.world().place is choice.plan.places[True]  # made once, for all pilots and the picture
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("warnings.warn", lambda *_, **__: None)
@@ -291,7 +291,7 @@ def test_auto_in_python(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> No
         named = replace(scene, render=replace(found))
         other = tsdf.render(named, spp=3, threads=2)
     np.testing.assert_array_equal(one.rgb, other.rgb)
-    monkeypatch.setattr(shot, "plan", lambda *_: pytest.fail("a plan is made"))
+    monkeypatch.setattr(shot, "plan", lambda *_, **__: pytest.fail("a plan is made"))
     assert shot.chosen(scene, "volume").spp == shot.SPP
     assert shot.chosen(replace(scene, render=Render("volume", 5)), target_error=0.1)[1:4] == (None, None, 0.1)
 
@@ -299,7 +299,7 @@ def test_auto_in_python(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.slow
 def test_without_a_stop_it_is_done_at_the_target(far: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     """Noise is what the target leaves beside bias and texture."""
-    monkeypatch.setattr(shot, "plan", lambda *_: far)
+    monkeypatch.setattr(shot, "plan", lambda *_, **__: far)
     choice = shot.chosen(far.scene)
     assert (choice.spp, choice.seconds) == (None, None) and choice.target_error is not None
     assert math.hypot(choice.target_error, far.chosen.floor.value) == pytest.approx(far.target)

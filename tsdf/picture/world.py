@@ -131,19 +131,6 @@ def camera_of(world: World) -> CameraArrays:
     )
 
 
-def check_seen(world: World) -> None:
-    """See to it that anything is in the picture.
-
-    Raises
-    ------
-    SceneError
-    """
-    if not sees(world):
-        raise SceneError(
-            f"{world.scene.name}: a camera looking at nothing: it sees neither a medium nor a surface; move its target"
-        )
-
-
 def sees(world: World) -> bool:
     """Return whether anything of the scene is in the picture, as far as one ray for each of some pixels tells.
 

@@ -38,7 +38,7 @@ TRUTH = 0.45  # share of the time for the truth, which all candidates are measur
 LEAST_RUNS, MOST_RUNS = 2, 1000
 TRIAL = 0.1  # share of a run's time after which a trial says how many samples it can have
 DOUBLINGS = 4  # of the samples of a run, at which its error is measured
-TRUE = 100.0  # times as often as others the truth is to meet lights, if by chance alone: its noise is in all errors
+TRUE = 4.0  # times that the truth is to meet lights a pixel, if by chance alone: its noise is in all errors
 LEAST_SAMPLES = 2  # of a pixel, for one has no variance
 MOST_PIXELS = 20_000_000  # of all pictures, which are in memory until the end: a gigabyte
 MEETINGS = 1.0 / SHOWN  # of lights that only chance finds, below which a picture of them is not believed
@@ -376,7 +376,7 @@ def truth_of(scene: Scene, sized: Sizing, left: Left) -> Way:
             failed = failed or error
             left.add(str(error), str(candidate))
             continue
-        few = TRUE * MEETINGS
+        few = max(TRUE * scene.camera.width * scene.camera.height, MEETINGS)
         if sized.blind(world, LEAST_SAMPLES, few) and sized.blind(world, sized.of(world, TRUTH), few):
             left.add(f"as the truth: suns and small lights would be met by less than {few:.0f} paths", str(candidate))
             continue

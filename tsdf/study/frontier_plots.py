@@ -158,7 +158,7 @@ def _against_bytes(axes: Any, frontier: Frontier) -> None:
         tops = [100.0 * row.floor.high for row in drawn]
         feet = [100.0 * (max(f.low, 0.5 * f.high) if f.seen else 0.7 * f.high) for f in (row.floor for row in drawn)]
         axes.set_ylim(0.7 * min(feet), 1.4 * max(tops))
-        sizes = [row.bytes / 1000.0 for row in frontier.rows]
+        sizes = [max(row.bytes, 1) / 1000.0 for row in frontier.rows]  # nothing is drawn from without grains
         axes.set_xlim(min(sizes) / 2.0, 2.0 * max(sizes))
     for row in drawn:
         value, low, high = (100.0 * x for x in row.floor[:3])
