@@ -201,12 +201,9 @@ def summary(world: "World", picture: "Picture", out: Path) -> None:
         say(line)
     lost = picture.truncated + picture.faults
     if lost:
-        faults = (
-            f", {picture.faults} of them at a fault of a mesh"
-            if picture.faults
-            else ", after more grains than any other"
-        )
-        click.echo(f"warning: {lost} paths were given up{faults}", err=True)
+        faults = f"{picture.faults} of them at a fault of a mesh"
+        why = faults if picture.faults else "after more grains than any other"
+        click.echo(f"warning: {lost} paths were given up, {why}", err=True)
 
 
 def fireflies(picture: "Picture") -> str | None:
@@ -231,10 +228,11 @@ def fireflies(picture: "Picture") -> str | None:
 
 def fewer_dots(world: "World") -> str:
     """Return what a scene can do about bright dots."""
+    from tsdf.scene.levels import LEVELS
     from tsdf.scene.specs import SunLight
 
     suns = any(isinstance(light, SunLight) for light in world.scene.lights)
-    aims = world.level in ("volume-hg", "isotropic")
+    aims = LEVELS[world.level].traits.points
     ways = ["a wider sun"] * suns + ["a level that aims all light, volume-hg or isotropic,"] * (not aims)
     return f"; {' or '.join(ways)} has fewer" if ways else ""
 
