@@ -27,7 +27,6 @@ from tsdf.scene.scene import GrainSpec, Scene, called
 from tsdf.spheres.around import ENDLESS, Around, across, around_of, entered, next_around
 from tsdf.spheres.packing import Cells, cells_of, next_sphere, pack
 from tsdf.vectors import KERNEL, dot, renewed, step, triple, unit_of
-from tsdf.walk.facets import Facets, facets_of
 from tsdf.walk.geometry import NONE, planes_of
 from tsdf.walk.room import stands
 from tsdf.walk.walker import write
@@ -46,7 +45,7 @@ class Grains(NamedTuple):
     seed (m,) uint64. Of components:
     share (c,): running sum of number fractions in each medium; eta, kept_apart (c,) (the polarisations), exemplar (c,)
     int32: ray-engine scene. Of the exemplars' facets: planes (f, 4), centroids (f, 3), first_facet (e,). first_side
-    (e + 1,), sides (s,): of exemplars that are convex and have few sides, a facet of each side. facets: of the others.
+    (e + 1,), sides (s,): of exemplars that are convex and have few sides, a facet of each side.
     """
 
     cells: tuple[Cells, ...]
@@ -63,7 +62,6 @@ class Grains(NamedTuple):
     first_facet: np.ndarray
     first_side: np.ndarray
     sides: np.ndarray
-    facets: Facets
 
 
 # ------------------------------------------------------------------------------------------- for kernels
@@ -277,10 +275,12 @@ def rim_of(p, d):
 
 @dataclass(eq=False)
 class Packed:
-    """The grains of a scene: arrays for kernels and the exemplars' ray-engine scenes; `kept` is for `standing`."""
+    """The grains of a scene: arrays for kernels, the exemplars' ray-engine scenes and corners of facets (f, 3, 3) [R];
+    `kept` is for `standing`."""
 
     arrays: Grains
     engines: list
+    meshes: list[np.ndarray]
     notes: tuple[str, ...]
     kept: Any = None
 
@@ -308,9 +308,8 @@ def nothing_packed(media: int, components: int) -> Packed:
         first_facet=np.zeros(0, np.int64),
         first_side=np.zeros(1, np.int64),
         sides=np.zeros(0, np.int64),
-        facets=facets_of([], []),
     )
-    return Packed(arrays, [], ())
+    return Packed(arrays, [], [], ())
 
 
 def sides_of(grain: Grain, planes: np.ndarray) -> list[int]:
@@ -402,7 +401,7 @@ def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed
     engines: list[Any] = []
     known: dict[str, int] = {}
     planes, centroids, first_facet, sides = [np.zeros((0, 4))], [np.zeros((0, 3))], [], [np.zeros(0, np.int64)]
-    meshes: list[np.ndarray | None] = []
+    meshes: list[np.ndarray] = []
     facets, at = 0, 0
     for medium, where in zip(scene.media, titles, strict=True):
         try:
@@ -429,7 +428,7 @@ def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed
                 centroids.append(corners.mean(axis=1))
                 first_facet.append(facets)
                 sides.append(facets + np.array(sides_of(grain, planes[-1]), np.int64))
-                meshes.append(None if len(sides[-1]) else corners)
+                meshes.append(corners)
                 facets += len(corners)
                 engines.append(embree_scene(grain))
             chosen.append(known[grain.mesh_hash])
@@ -449,6 +448,5 @@ def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed
         first_facet=np.array(first_facet, np.int64),
         first_side=np.cumsum([len(own) for own in sides]),
         sides=np.concatenate(sides),
-        facets=facets_of(meshes, first_facet),
     )
-    return Packed(arrays, engines, tuple(notes))
+    return Packed(arrays, engines, meshes, tuple(notes))
