@@ -139,7 +139,7 @@ class Walkers:
         self.spectrum = np.zeros(world.absorption.spectral.shape[1])
         self.lanes = self.abreast = None
         if lanes.suited(world.place.arrays, world.media):
-            self.lanes = lanes.lanes_of(world.amounts)
+            self.lanes = lanes.lanes_of(world.place.arrays, world.amounts)
             self.abreast = Handle(self.lanes)
         self.radiance = np.zeros((BLOCK, 3))  # more than most need: to lay it out takes as long as 2000 samples
         self._lay_out()
