@@ -63,6 +63,8 @@ class Lanes(NamedTuple):
     0 on, and from WIDTH on of those that are about to, and room for a shadow's amounts. gone, ready, others (WIDTH,):
     lanes whose walk has ended, and of those that are about to, which do walk and which do not. counts (4,): lanes that
     walk, the next sample, how many are ready, walkers handed over. body: what they walk in, see `sides.body_of`.
+    ends (samples, 10 + a): of those that find light, where they began, where they were last, which way they went from
+    there, weight and amounts; no rows where nobody asks.
     """
 
     numbers: np.ndarray
@@ -73,6 +75,7 @@ class Lanes(NamedTuple):
     others: np.ndarray
     counts: np.ndarray
     body: np.ndarray
+    ends: np.ndarray
 
 
 def suited(g: Geometry, media: Media) -> bool:
@@ -81,12 +84,12 @@ def suited(g: Geometry, media: Media) -> bool:
     return alone and not media.traits.placed and not media.singles
 
 
-def lanes_of(g: Geometry, amounts: int) -> Lanes:
-    """Return lanes without walkers, in the first medium, for so many amounts."""
+def lanes_of(g: Geometry, amounts: int, samples: int = 0) -> Lanes:
+    """Return lanes without walkers in the first medium, for so many amounts, that keep the ends of so many samples."""
     return Lanes(
         np.zeros(NUMBERS * STRIDE), np.zeros(WORDS * STRIDE, np.uint64), np.zeros((2 * WIDTH + 1, amounts)),
         np.zeros(WIDTH, np.int64), np.zeros(WIDTH, np.int64), np.zeros(WIDTH, np.int64), np.zeros(4, np.int64),
-        body_of(g),
+        body_of(g), np.zeros((samples, 10 + amounts)),
     )  # fmt: skip
 
 
@@ -163,6 +166,9 @@ def begin(lanes, job, first, count):
         size = 1.0 / math.sqrt(dot(d, d))
         put(numbers, PX, i, step(step(origin, x, aside), y, below))
         put(numbers, DX, i, (d[0] * size, d[1] * size, d[2] * size))
+    for i in range(WIDTH, WIDTH + count if lanes.ends.shape[0] > 0 else WIDTH):
+        own = lanes.ends[words[at(SAMPLE, i)]]
+        own[0], own[1], own[2] = three(numbers, PX, i)
 
 
 @njit(**KERNEL)
@@ -459,7 +465,14 @@ def settle(world, batch, lanes, i):
         light = world.lights.constant[0], world.lights.constant[1], world.lights.constant[2]
         if varied(world.lights):
             light = light_from(world.lights, three(numbers, DX, i), numbers[at(PDF, i)])
-        give(world, batch, lanes.words[at(SAMPLE, i)], amounts, numbers[at(WEIGHT, i)], light)
+        sample = lanes.words[at(SAMPLE, i)]
+        give(world, batch, sample, amounts, numbers[at(WEIGHT, i)], light)
+        if lanes.ends.shape[0] > 0:
+            own = lanes.ends[sample]
+            own[3], own[4], own[5] = three(numbers, PX, i)
+            own[6], own[7], own[8] = three(numbers, DX, i)
+            own[9] = numbers[at(WEIGHT, i)]
+            copy(own[10:], amounts)
     elif state == np.uint64(LOST):
         note(batch, lanes, i)
         copy(batch.amounts[lanes.counts[HANDED]], amounts)

@@ -222,7 +222,7 @@ def walk(standing, near, world, batch, crew, job, total):
     counts, first = crew.counts, batch.walkers.shape[0] - CREW
     counts[OTHERS] = 0
     for _ in range(CREWS):
-        if counts[NEXT] == total or counts[OTHERS] + CREW > first:
+        if counts[NEXT] == total or 4 * counts[OTHERS] > first:
             break
         count = min(CREW, total - counts[NEXT])
         spawn(batch, first, job, counts[NEXT], count)
