@@ -171,7 +171,7 @@ def _abreast(
     began = time.thread_time()
     mine.reserve(paths)
     mine.lanes = own = lanes.lanes_of(world.place.arrays, world.amounts, paths)
-    abreast, ends, live = Handle(own), own.ends, 0
+    abreast, ends = Handle(own), own.ends
     job = transport.Job(camera, 0, paths, first, seed)
     while own.counts[lanes.LIVE] or own.counts[lanes.NEXT] < paths:
         lanes.walk(mine.arrays, mine.batches[0], abreast, job, paths)

@@ -17,7 +17,7 @@ ROWS = 13  # of a block of `seen`; `around.met` knows the first four
 MARGIN = 1e-3  # of an ellipsoid's axes, far more than the rounding of float32
 THINNEST = 0.02  # axis of an ellipsoid [R]
 WORTH = 0.9  # of the sphere's mean shadow: an ellipsoid of more is no help
-DIRECTIONS = 400  # in which the points are looked for that an ellipsoid is laid about
+DIRECTIONS = 150  # in which the points are looked for that an ellipsoid is laid about
 SPARE = 0.01  # the ellipsoid's volume is the smallest possible but for about this
 
 
@@ -61,13 +61,13 @@ def ellipsoid_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     turns = np.arange(DIRECTIONS) + 0.5
     z, phi = 1.0 - 2.0 * turns / DIRECTIONS, turns * math.pi * (3.0 - math.sqrt(5.0))
     ways = np.stack((np.sqrt(1.0 - z * z) * np.cos(phi), np.sqrt(1.0 - z * z) * np.sin(phi), z))
-    some = points[np.unique((points @ ways).argmax(axis=0))]
+    some = points[np.unique((ways.T @ points.T).argmax(axis=1))]
     lifted, share = np.column_stack((some, np.ones(len(some)))), np.full(len(some), 1.0 / len(some))
     while True:
         moments = (lifted.T * share) @ lifted
         far = np.einsum("ij,ij->i", lifted, np.linalg.solve(moments, lifted.T).T)
         j = int(far.argmax())
-        if far[j] < 4.0 * (1.0 + SPARE):
+        if not far[j] >= 4.0 * (1.0 + SPARE):
             break
         move = (far[j] - 4.0) / (4.0 * (far[j] - 1.0))
         share *= 1.0 - move
