@@ -20,7 +20,7 @@ from tsdf.vectors import KERNEL, step, triple, unit_of
 from tsdf.walk import explicit as X
 from tsdf.walk.facets import Facets, facet_met, facets_of
 from tsdf.walk.geometry import Place
-from tsdf.walk.hulls import ROWS, WORTH, ellipsoid_of, reach_of, rows_of, seen, shadow
+from tsdf.walk.hulls import MARGIN, ROWS, WORTH, ellipsoid_of, reach_of, rows_of, seen, shadow
 from tsdf.walk.hybrid import hand_over
 from tsdf.walk.lights import radiance as light_from
 from tsdf.walk.lots import (
@@ -396,10 +396,10 @@ def _found(grains: X.Grains, place: Place) -> tuple[np.ndarray, np.ndarray, np.n
 def _hulls(packed: X.Packed, component: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return what `hulls` knows of each grain (n, ROWS - 4), nothing (n, 0) where it is no help, and the corners (n, 3)
     of boxes about what it fills, relative to its centre."""
-    exemplar, count = packed.arrays.exemplar, len(component)
     from scipy.spatial.transform import Rotation
 
-    ball = np.eye(3), np.zeros(3)
+    exemplar, count = packed.arrays.exemplar, len(component)
+    ball = np.eye(3) / (1.0 + MARGIN), np.zeros(3)
     found = [ball if e == X.EXACT_SPHERE else ellipsoid_of(packed.meshes[e].reshape(-1, 3)) for e in exemplar]
     found = [one if shadow(one[0]) < WORTH else ball for one in found]
     if all(one is ball for one in found):
