@@ -1,4 +1,4 @@
-"""The same cube of grains in Mitsuba 3 and in our renderer: ``python benchmarks/bench_mitsuba.py --help``.
+"""The same cube and ball of grains in Mitsuba 3 and in our renderer: ``python benchmarks/bench_mitsuba.py --help``.
 
 Three are timed turn by turn in one process, processor time of all threads: our integrator ``tpt`` and Mitsuba's own
 ``volpath`` with ``tabphase``, and our renderer's level `teleport`. ``tpt`` is set against ``volpath`` per event, grains
@@ -11,6 +11,7 @@ import argparse
 import math
 import statistics
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import mitsuba as mi
@@ -23,8 +24,8 @@ from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Effort, exact_sphere
 from tsdf.picture import render, world
-from tsdf.scene.scene import Box, Camera, ConstantLight, GrainSpec, MediumSpec, Scene, SunLight
-from tsdf.scene.specs import Light
+from tsdf.scene.scene import Box, Camera, ConstantLight, GrainSpec, MediumSpec, Scene, Sphere, SunLight
+from tsdf.scene.specs import Light, MediumShape
 
 PACKING = 0.5
 SIDE = 48  # pixels
@@ -39,14 +40,19 @@ OWN: dict[str, Light] = {
     "directional": SunLight((0.36, -0.48, 0.8), (3.0, 3.0, 3.0), 0.01),
 }
 GOAL = 3.0  # times the speed of tpt
+BODIES: dict[str, Callable[[float], MediumShape]] = {
+    "cube": lambda half: Box((-half,) * 3, (half,) * 3),
+    "ball": lambda half: Sphere((0.0, 0.0, 0.0), half),
+}
 
 
-def scene_of(half: float, light: str, interior: dict, integrator: dict) -> object:
-    """Return a cube of grains that fills the middle of the picture."""
+def scene_of(body: str, half: float, light: str, interior: dict, integrator: dict) -> object:
+    """Return a cube or a ball of grains that fills the middle of the picture."""
     at = [0.5 * half, -5.0 * half, 1.2 * half]
     look = mi.ScalarTransform4f().look_at(at, [0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
-    boundary = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(half), "bsdf": {"type": "null"}}
+    shape = "sphere" if body == "ball" else "cube"
+    boundary = {"type": shape, "to_world": mi.ScalarTransform4f().scale(half), "bsdf": {"type": "null"}}
     sensor = {"type": "perspective", "fov": 25.0, "to_world": look, "film": film}
     return mi.load_dict(
         {
@@ -54,7 +60,7 @@ def scene_of(half: float, light: str, interior: dict, integrator: dict) -> objec
             "integrator": integrator,
             "sensor": sensor,
             "light": LIGHTS[light],
-            "cube": boundary | {"interior": interior},
+            "body": boundary | {"interior": interior},
         }
     )
 
@@ -66,21 +72,21 @@ def seconds(scene: object, spp: int, seed: int) -> tuple[float, np.ndarray]:
     return time.process_time() - begin, picture
 
 
-def own_scene(table: Table, half: float, light: str) -> Scene:
+def own_scene(table: Table, body: str, half: float, light: str) -> Scene:
     """Return the same scene for our own renderer."""
     camera = Camera((0.5 * half, -5.0 * half, 1.2 * half), (0.0, 0.0, 0.0), SIDE, SIDE, fov_deg=25.0)
-    medium = MediumSpec(Box((-half,) * 3, (half,) * 3), PACKING, 1.0, (GrainSpec(table),), name="grains")
+    medium = MediumSpec(BODIES[body](half), PACKING, 1.0, (GrainSpec(table),), name="grains")
     return Scene(camera, (OWN[light],), (medium,), name="bench")
 
 
-def row(table: Table, half: float, light: str, spp: int) -> str:
-    """Return a line about one cube in one light."""
-    tpt = scene_of(half, light, loader.granular(table, PACKING, 1.0), {"type": "tpt", "count": True})
+def row(table: Table, body: str, half: float, light: str, spp: int) -> str:
+    """Return a line about one body in one light."""
+    tpt = scene_of(body, half, light, loader.granular(table, PACKING, 1.0), {"type": "tpt", "count": True})
     stock = {"type": "volpath", "max_depth": -1, "rr_depth": 1_000_000}
-    volpath = scene_of(half, light, loader.medium(table, PACKING, 1.0), stock)
-    scene = own_scene(table, half, light)
+    volpath = scene_of(body, half, light, loader.medium(table, PACKING, 1.0), stock)
+    scene = own_scene(table, body, half, light)
     own = world.build(scene, "teleport")
-    counted = render.render(world.build(own_scene(table, half, "constant"), "volume"), spp=32)
+    counted = render.render(world.build(own_scene(table, body, half, "constant"), "volume"), spp=32)
     scattered = counted.events / counted.samples.sum()
     samples = spp * SIDE**2
     events: list[tuple[float, float]] = []
@@ -106,8 +112,8 @@ def row(table: Table, half: float, light: str, spp: int) -> str:
     error = math.sqrt(2.0 * variance / (SIDE**2 * TURNS))  # as much noise in tpt's
     off = f"{theirs / mean - 1.0:+.1e} +- {error / mean:.0e}"
     return (
-        f"| {half:g} | {light} | {a:.0f} | {b:.0f} | {b / a:.2f} | {met:.1f} | {scattered:.1f} | {c:.2f} | {d:.2f} "
-        f"| {faster:.1f} | {off} |"
+        f"| {body} | {half:g} | {light} | {a:.0f} | {b:.0f} | {b / a:.2f} | {met:.1f} | {scattered:.1f} | {c:.2f} "
+        f"| {d:.2f} | {faster:.1f} | {off} |"
     )
 
 
@@ -115,6 +121,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", nargs="?", help="a table; without, the exact sphere of eta 1.33")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="variant of Mitsuba (llvm_ad_rgb)")
+    parser.add_argument("--body", choices=tuple(BODIES), help="which (both)")
     parser.add_argument("--spp", type=int, default=128, help="samples per pixel (128)")
     parser.add_argument("--out", type=Path, default=Path("bench"), help="folder for the results")
     args = parser.parse_args()
@@ -129,15 +136,16 @@ def main() -> None:
         f"{table!r}; processor time of all threads, medians of {TURNS} turns of {args.spp} samples per pixel. Goal: our"
         f" renderer {GOAL:g} times as fast as tpt.",
         "",
-        "| half side / R | light | tpt ns/event | volpath ns/event | ratio | tpt events | volpath events "
+        "| body | half its width / R | light | tpt ns/event | volpath ns/event | ratio | tpt events | volpath events "
         "| tpt us/sample | ours us/sample | ours is faster | tpt's mean / ours - 1 |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     print("\n".join(text), flush=True)
-    for half in (4.0, 12.0, 40.0):
-        for light in LIGHTS:
-            text.append(row(table, half, light, args.spp))
-            print(text[-1], flush=True)
+    for body in BODIES if args.body is None else (args.body,):
+        for half in (4.0, 12.0, 40.0):
+            for light in LIGHTS:
+                text.append(row(table, body, half, light, args.spp))
+                print(text[-1], flush=True)
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "mitsuba.md").write_text("\n".join(text) + "\n")
 

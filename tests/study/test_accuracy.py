@@ -131,6 +131,31 @@ def test_the_same_numbers_for_any_threads(grain: GrainSpec) -> None:
     assert not np.array_equal(other.place, one.place)
 
 
+@pytest.mark.parametrize("level", ["teleport", "volume-hg"])
+def test_slabs_in_lanes_are_the_same_path_by_path(
+    level: str, grain: GrainSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one by one: where each began, the line on which it came out, its weight, what it crossed; some are handed
+    over. Control: another seed's are others."""
+    dark = replace(grain, absorption=Absorption("grey", (0.2,)))
+    one = slab_experiment(level, dark, 0.5, 8.0)
+    few = replace(one.world, media=one.world.media._replace(limit=40))
+
+    def taken(seed: int = 1) -> tuple[np.ndarray, experiment.Ends]:
+        _, ends = experiment.follow(few, one.camera, 3000, seed, threads=1)
+        return one.read(np.zeros(0), ends), ends
+
+    (found, ends), (other, _) = taken(), taken(2)
+    with monkeypatch.context() as patch:
+        patch.setattr(experiment.lanes, "suited", lambda *_: False)
+        expected, wanted = taken()
+    assert (np.abs(found - expected) < 1e-9).all(axis=1).mean() > 0.999
+    assert (np.abs(found - other) < 1e-9).all(axis=1).mean() < 0.9
+    assert np.array_equal(ends.start, wanted.start) and abs(ends.events / wanted.events - 1.0) < 1e-3
+    out = (wanted.weight > 0.0) & (np.abs(found - expected) < 1e-9).all(axis=1)
+    assert ends.amounts[out] == pytest.approx(wanted.amounts[out], rel=1e-9) and out.mean() > 0.5
+
+
 def test_absorption_can_be_taken_off_afterwards(table: Table, grain: GrainSpec) -> None:
     """One run of lossless paths gives what a run with absorption gives, within 4 standard errors of both; and without
     any it is the lossless run to the last bit. Control: twice the coefficient is rejected."""

@@ -30,6 +30,7 @@ from tsdf.walk import lanes, transport, walker
 ONE = ConstantLight((1.0, 1.0, 1.0))
 SUN = SunLight((0.36, -0.48, 0.8), (3.0, 2.0, 1.0), 2.0)
 BOX = Box((-4.0, -5.0, -3.0), (6.0, 5.0, 4.0))
+BALL = Sphere((0.5, 0.3, -0.2), 5.0)
 OUTSIDE = Camera((3.0, -30.0, 7.0), (0.0, 0.0, 0.0), 20, 15, fov_deg=30.0)
 INSIDE = Camera((0.3, -0.2, 0.1), (1.0, 0.5, 0.3), 16, 12, fov_deg=100.0)
 ABOVE = Camera((0.0, 0.0, 30.0), (1.0, 2.0, 0.0), 16, 12, fov_deg=60.0)
@@ -94,9 +95,13 @@ def test_same_light_that_is_aimed(level: str, table, sky) -> None:
 
 
 @pytest.mark.parametrize(
-    "shape, camera", [(BOX, INSIDE), (Slab(-3.0, 3.0), INSIDE), (Slab(-3.0, 3.0), ABOVE), (Slab(-3.0, 0.5), OUTSIDE)]
-)
-def test_same_in_slabs_and_from_inside(shape, camera, table, sky) -> None:
+    "shape, camera",
+    [
+        (BOX, INSIDE), (Slab(-3.0, 3.0), INSIDE), (Slab(-3.0, 3.0), ABOVE), (Slab(-3.0, 0.5), OUTSIDE),
+        (BALL, INSIDE), (BALL, OUTSIDE),
+    ],
+)  # fmt: skip
+def test_same_in_each_shape_and_from_inside(shape, camera, table, sky) -> None:
     check(world.build(scene_of(shape, (SUN, sky), GrainSpec(table), camera=camera), "teleport"))
 
 
@@ -137,8 +142,9 @@ def test_handed_over(limit: int, table, sky) -> None:
 
 def test_furnace_is_exact(table) -> None:
     """Light that loses nothing is 1 to the last bit, in every pixel."""
-    picture = render.render(world.build(scene_of(BOX, (ONE,), GrainSpec(table)), "teleport"), spp=32, seed=1)
-    assert (picture.rgb == 1.0).all() and picture.truncated == 0
+    for shape in (BOX, BALL):
+        picture = render.render(world.build(scene_of(shape, (ONE,), GrainSpec(table)), "teleport"), spp=32, seed=1)
+        assert (picture.rgb == 1.0).all() and picture.truncated == 0
 
 
 def test_any_number_of_threads_and_portions(table, sky) -> None:
@@ -163,7 +169,7 @@ def test_stops_when_told(table) -> None:
 
 
 def test_who_walks_in_lanes(table) -> None:
-    """A lone box or slab, at levels that know no packing; nothing else."""
+    """A lone box, slab or ball, at levels that know no packing; nothing else."""
 
     def walks(*shapes, level: str = "teleport") -> bool:
         media = tuple(MediumSpec(shape, 0.5, 1.0, (GrainSpec(table),)) for shape in shapes)
@@ -172,7 +178,7 @@ def test_who_walks_in_lanes(table) -> None:
 
     assert walks(BOX) and walks(Slab(0.0, 1.0)) and walks(BOX, level="isotropic")
     assert not any(walks(BOX, level=level) for level in ("explicit", "teleport-packed", "teleport-memory"))
-    assert not walks(Sphere((0.0, 0.0, 0.0), 3.0))
+    assert walks(BALL) and not walks(BALL, level="teleport-memory")
     assert not walks(BOX, Box((10.0, 0.0, 0.0), (15.0, 5.0, 5.0)))
 
 

@@ -82,7 +82,7 @@ def test_chains_and_the_ray_engine(heap: MediumSpec, monkeypatch: pytest.MonkeyP
         assert one.rgb == pytest.approx(other.rgb, rel=1e-9) and one.events == other.events > 1000
     monkeypatch.setattr(facets, "MOST_FACETS", 100)
     made = world.build(scene(heap), "explicit")
-    assert (made.packed.arrays.facets.where < 0).all()
+    assert (standing.standing(made.packed, made.place, 2).facets.where < 0).all()
     one, other = pictures(made, monkeypatch)
     assert one.rgb == pytest.approx(other.rgb, rel=1e-6) and one.events == other.events
 
@@ -115,6 +115,6 @@ def test_where_grains_do_not_stand_alone(heap: MediumSpec, monkeypatch: pytest.M
         made = world.build(other, "explicit")
         assert not standing.standing(made.packed, made.place, 2).there
     made = world.build(whole, "explicit")
-    assert standing.standing_of(made.packed.arrays, made.place, 2).there
+    assert standing.standing_of(made.packed, made.place, 2).there
     monkeypatch.setattr(standing, "MOST", 40)
-    assert not standing.standing_of(made.packed.arrays, made.place, 2).there
+    assert not standing.standing_of(made.packed, made.place, 2).there

@@ -7,7 +7,7 @@ import threading
 
 from tsdf.compiled import compile_ahead, end_with_parent
 from tsdf.scene.levels import AUTO, LEVELS
-from tsdf.scene.specs import Box, Scene, Slab
+from tsdf.scene.specs import Box, Scene, Slab, Sphere
 from tsdf.walk import transport
 
 
@@ -19,7 +19,7 @@ def begin(scene: Scene | None = None, level: str = AUTO) -> None:
 
 def _lone(scene: Scene, level: str) -> bool:
     """Return whether a scene is walked in lanes, see `lanes.suited`."""
-    alone = len(scene.media) == 1 and isinstance(scene.media[0].shape, Box | Slab) and not scene.surfaces
+    alone = len(scene.media) == 1 and isinstance(scene.media[0].shape, Box | Slab | Sphere) and not scene.surfaces
     return alone and not LEVELS[level].traits.placed and not scene.render.explicit_grains
 
 

@@ -122,6 +122,8 @@ class Walkers:
         if world.media.singles and not self.answered and world.scene.media:
             found = standing.standing(world.packed, world.place, len(world.scene.media[0].grains))
             self.standing = Handle(found) if found.there else None
+        self.crew = standing.crew_of()
+        self.together = Handle(self.crew)
         exemplars = len(self.packed.engines)
         self.walkers = [np.zeros(ROOM, W.WALKER) for _ in range(2)]
         self.amounts = [np.zeros((ROOM, world.amounts)) for _ in range(2)]
@@ -137,7 +139,7 @@ class Walkers:
         self.spectrum = np.zeros(world.absorption.spectral.shape[1])
         self.lanes = self.abreast = None
         if lanes.suited(world.place.arrays, world.media):
-            self.lanes = lanes.lanes_of(world.amounts)
+            self.lanes = lanes.lanes_of(world.place.arrays, world.amounts)
             self.abreast = Handle(self.lanes)
         self.radiance = np.zeros((BLOCK, 3))  # more than most need: to lay it out takes as long as 2000 samples
         self._lay_out()
@@ -172,9 +174,9 @@ class Walkers:
         total = pixels * job.spp
         self.reserve(total)
         first, live = 0, 0
-        if self.lanes is not None:
+        if self.lanes is not None or self.standing:
             first = total
-            self.walk(job, total, stop)
+            (self.walk if self.lanes is not None else self.visit)(job, total, stop)
         while (live or first < total) and not stop.is_set():
             if live <= SLOTS // 2 and first < total:
                 fresh = min(SLOTS - live, total - first)
@@ -190,9 +192,20 @@ class Walkers:
         counts[:] = 0
         while (counts[lanes.LIVE] or counts[lanes.NEXT] < total) and not stop.is_set():
             lanes.walk(self.arrays, self.batches[0], self.abreast, job, total)
-            live = int(counts[lanes.HANDED])
-            while live and not stop.is_set():
-                live = self.turn(live)
+            self.finish(int(counts[lanes.HANDED]), stop)
+
+    def visit(self, job: transport.Job, total: int, stop: threading.Event) -> None:
+        """Walk the samples of a job, `total` of them, from grain to grain of those that stand alone."""
+        counts = self.crew.counts
+        counts[:] = 0
+        while counts[standing.NEXT] < total and not stop.is_set():
+            standing.walk(self.standing, self.near, self.arrays, self.near_batches[0], self.together, job, total)
+            self.finish(int(counts[standing.OTHERS]), stop)
+
+    def finish(self, live: int, stop: threading.Event) -> None:
+        """Take the first `live` of ``walkers[0]`` to their ends."""
+        while live and not stop.is_set():
+            live = self.turn(live)
 
     def spawn(self, live: int, job: transport.Job, first: int, count: int) -> None:
         """Start walkers, behind the first `live` of ``walkers[0]``, for samples first .. first + count - 1 of a job."""

@@ -15,12 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from tsdf.data.table import Table
+from tsdf.handle import Handle
 from tsdf.picture.render import SLOTS, Walkers
 from tsdf.picture.world import World, beam, build
 from tsdf.scene.scene import Absorption, Camera, ConstantLight, GrainSpec, MediumSpec, Render, Scene, Slab, Sphere
 from tsdf.spheres.around import around_of
 from tsdf.spheres.packing import cells_of, pack
-from tsdf.walk import transport
+from tsdf.walk import lanes, transport
 from tsdf.walk import walker as W
 
 WIDE = 300.0  # [R] width of beams, so that they see many places of a packing
@@ -141,6 +142,8 @@ def _batch(
     world: World, camera: transport.CameraArrays, first: int, paths: int, seed: int, marks: int
 ) -> tuple[np.ndarray, Ends]:
     """Follow paths to their end, or past their limit of events so often; return as `follow` does."""
+    if marks == 1 and lanes.suited(world.place.arrays, world.media):
+        return _abreast(world, camera, first, paths, seed)
     places = np.zeros((paths, marks, 3))
     start, place, way = (np.zeros((paths, 3)) for _ in range(3))
     weight, amounts = np.zeros(paths), np.zeros((paths, world.amounts))
@@ -158,6 +161,33 @@ def _batch(
 
     events, drawn, seconds = trips(world, camera, first, paths, seed, heard, begin)
     return places, Ends(start, place, way, weight, amounts, events, drawn, seconds)
+
+
+def _abreast(
+    world: World, camera: transport.CameraArrays, first: int, paths: int, seed: int
+) -> tuple[np.ndarray, Ends]:
+    """Follow paths to their end in lanes, as `_batch` does one by one."""
+    mine = Walkers(world)
+    began = time.thread_time()
+    mine.reserve(paths)
+    mine.lanes = own = lanes.lanes_of(world.place.arrays, world.amounts, paths)
+    abreast, ends = Handle(own), own.ends
+    job = transport.Job(camera, 0, paths, first, seed)
+    while own.counts[lanes.LIVE] or own.counts[lanes.NEXT] < paths:
+        lanes.walk(mine.arrays, mine.batches[0], abreast, job, paths)
+        live = int(own.counts[lanes.HANDED])
+        while live:
+            before, live = live, mine.turn(live)
+            gone = np.flatnonzero(mine.walkers[1][:before]["sample"] < 0)
+            those = mine.walkers[1][gone]
+            ends[~those["sample"], 3:] = np.column_stack(
+                (those["p"], those["d"], those["weight"], mine.amounts[1][gone])
+            )
+    counters = mine.counters
+    met, seconds = int(counters[W.EVENTS]), time.thread_time() - began
+    drawn = met - int(counters[W.LEAPT]) + int(counters[W.LEAPS])
+    start, place, way, weight, amounts = np.split(ends, (3, 6, 9, 10), axis=1)
+    return place[:, None], Ends(start, place, way, weight[:, 0], amounts, met, drawn, seconds)
 
 
 def follow(

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tsdf.compiled import njit
+from tsdf.compiled import bits_of, njit
 from tsdf.data.sampler import turned as on_circle
 from tsdf.data.table import Table
 from tsdf.errors import SceneError, TSDFError
@@ -27,7 +27,6 @@ from tsdf.scene.scene import GrainSpec, Scene, called
 from tsdf.spheres.around import ENDLESS, Around, across, around_of, entered, next_around
 from tsdf.spheres.packing import Cells, cells_of, next_sphere, pack
 from tsdf.vectors import KERNEL, dot, renewed, step, triple, unit_of
-from tsdf.walk.facets import Facets, facets_of
 from tsdf.walk.geometry import NONE, planes_of
 from tsdf.walk.room import stands
 from tsdf.walk.walker import write
@@ -35,6 +34,7 @@ from tsdf.walk.walker import write
 EXACT_SPHERE = -1
 ENTERED, INSIDE, RETRIED, LEFT = 0, 1, 2, 4
 MOST_SIDES = 64  # of a convex grain that needs no ray engine, which with more is faster
+SIDE, LAST = np.int64(MOST_SIDES - 1), np.int64(2**63 - 1)  # the bits of a number of a side, and beyond all distances
 HARDLY = 1e-6  # [R] beyond a sphere where no grain stands, the next is looked for
 FLAT = 1e-9  # [R] planes that near to each other are one side, and no vertex of a convex grain is higher over one
 
@@ -46,7 +46,8 @@ class Grains(NamedTuple):
     seed (m,) uint64. Of components:
     share (c,): running sum of number fractions in each medium; eta, kept_apart (c,) (the polarisations), exemplar (c,)
     int32: ray-engine scene. Of the exemplars' facets: planes (f, 4), centroids (f, 3), first_facet (e,). first_side
-    (e + 1,), sides (s,): of exemplars that are convex and have few sides, a facet of each side. facets: of the others.
+    (e + 1,), sides (s,), side_planes (4, s): of exemplars that are convex and have few sides, a facet of each side and
+    its plane.
     """
 
     cells: tuple[Cells, ...]
@@ -63,7 +64,7 @@ class Grains(NamedTuple):
     first_facet: np.ndarray
     first_side: np.ndarray
     sides: np.ndarray
-    facets: Facets
+    side_planes: np.ndarray
 
 
 # ------------------------------------------------------------------------------------------- for kernels
@@ -198,23 +199,22 @@ def through_sphere(p, d, eta, kept_apart, key):
 @njit(**KERNEL)
 def side_met(grains, e, w):
     """Return the facet of convex exemplar e that a walker in its frame meets next, -1 for none."""
-    p, d, planes = triple(w.e), triple(w.d), grains.planes
-    near, far, entry, way_out = 0.0, math.inf, NONE, NONE
-    for at in range(grains.first_side[e], grains.first_side[e + 1]):
-        facet = grains.sides[at]
-        n = (planes[facet, 0], planes[facet, 1], planes[facet, 2])
-        cosine, under = dot(n, d), planes[facet, 3] - dot(n, p)
-        if cosine > 0.0:
-            if under < far * cosine:
-                far, way_out = under / cosine, facet
-        elif cosine < 0.0:
-            if under < near * cosine:
-                near, entry = under / cosine, facet
-        elif under < 0.0:
-            far = -math.inf
+    p, d, planes, first = triple(w.e), triple(w.d), grains.side_planes, grains.first_side[e]
+    x, y, z, h = planes[0], planes[1], planes[2], planes[3]
+    # Several sides are worked out at once: as whole numbers, the bits of distances are in their order, and the last few
+    # have room for the side
+    entry, way_out, misses = np.int64(0), LAST, np.int64(0)
+    for at in range(first, grains.first_side[e + 1]):
+        cosine = x[at] * d[0] + y[at] * d[1] + z[at] * d[2]
+        under = h[at] - (x[at] * p[0] + y[at] * p[1] + z[at] * p[2])
+        t = under / cosine
+        key = bits_of(t if t > 0.0 else 0.0) & ~SIDE | (at - first)
+        way_out = min(way_out, key if cosine > 0.0 else LAST)
+        entry = max(entry, key if cosine < 0.0 else np.int64(0))
+        misses |= np.int64((cosine == 0.0) & (under < 0.0))
     if w.state & INSIDE:
-        return way_out
-    return entry if near < far else NONE
+        return grains.sides[first + (way_out & SIDE)] if way_out < LAST else NONE
+    return grains.sides[first + (entry & SIDE)] if SIDE < entry < way_out and misses == 0 else NONE
 
 
 @njit(**KERNEL)
@@ -277,10 +277,12 @@ def rim_of(p, d):
 
 @dataclass(eq=False)
 class Packed:
-    """The grains of a scene: arrays for kernels and the exemplars' ray-engine scenes; `kept` is for `standing`."""
+    """The grains of a scene: arrays for kernels, the exemplars' ray-engine scenes and corners of facets (f, 3, 3) [R];
+    `kept` is for `standing`."""
 
     arrays: Grains
     engines: list
+    meshes: list[np.ndarray]
     notes: tuple[str, ...]
     kept: Any = None
 
@@ -308,9 +310,9 @@ def nothing_packed(media: int, components: int) -> Packed:
         first_facet=np.zeros(0, np.int64),
         first_side=np.zeros(1, np.int64),
         sides=np.zeros(0, np.int64),
-        facets=facets_of([], []),
+        side_planes=np.zeros((4, 0)),
     )
-    return Packed(arrays, [], ())
+    return Packed(arrays, [], [], ())
 
 
 def sides_of(grain: Grain, planes: np.ndarray) -> list[int]:
@@ -402,7 +404,7 @@ def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed
     engines: list[Any] = []
     known: dict[str, int] = {}
     planes, centroids, first_facet, sides = [np.zeros((0, 4))], [np.zeros((0, 3))], [], [np.zeros(0, np.int64)]
-    meshes: list[np.ndarray | None] = []
+    meshes: list[np.ndarray] = []
     facets, at = 0, 0
     for medium, where in zip(scene.media, titles, strict=True):
         try:
@@ -429,7 +431,7 @@ def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed
                 centroids.append(corners.mean(axis=1))
                 first_facet.append(facets)
                 sides.append(facets + np.array(sides_of(grain, planes[-1]), np.int64))
-                meshes.append(None if len(sides[-1]) else corners)
+                meshes.append(corners)
                 facets += len(corners)
                 engines.append(embree_scene(grain))
             chosen.append(known[grain.mesh_hash])
@@ -449,6 +451,6 @@ def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed
         first_facet=np.array(first_facet, np.int64),
         first_side=np.cumsum([len(own) for own in sides]),
         sides=np.concatenate(sides),
-        facets=facets_of(meshes, first_facet),
+        side_planes=np.ascontiguousarray(np.concatenate(planes)[np.concatenate(sides)].T),
     )
-    return Packed(arrays, engines, tuple(notes))
+    return Packed(arrays, engines, meshes, tuple(notes))

@@ -1,12 +1,13 @@
-"""Light in a lone box: many walkers at once, in lanes, step by step together.
+"""Light in a lone box or ball: many walkers at once, in lanes, step by step together.
 
-Where nothing is in a scene but one medium in a box or a slab, `transport.wander` is what nearly all walkers do, and a
-processor waits: each of their steps needs the one before it and ends in a branch that nobody guesses. Here walkers lie
-in lanes, each number of all of them side by side, and take a step together, so that the compiler works out several at
-once: a flight, a grain, the jump to where light leaves it. Those that are out find their light, and the next samples
-take their lanes. A sample's random numbers, and what is done with them, are those of `transport`, in the same order: a
-reader may hold `fly` against the first half of `wander` and `land` against its second. Loops without branches are those
-that the compiler works out several turns at once of. What is rare is handed over as it stands, to go on alone.
+Where nothing is in a scene but one medium in a box, a slab or a ball, `transport.wander` is what nearly all walkers do,
+and a processor waits: each of their steps needs the one before it and ends in a branch that nobody guesses. Here
+walkers lie in lanes, each number of all of them side by side, and take a step together, so that the compiler works out
+several at once: a flight, a grain, the jump to where light leaves it. Those that are out find their light, and the next
+samples take their lanes. A sample's random numbers, and what is done with them, are those of `transport`, in the same
+order: a reader may hold `fly` against the first half of `wander` and `land` against its second. Loops without branches
+are those that the compiler works out several turns at once of. What is rare is handed over as it stands, to go on
+alone.
 """
 
 import math
@@ -22,8 +23,8 @@ from tsdf.walk.geometry import NONE, Geometry
 from tsdf.walk.grid import GRAZING
 from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, ROOM, leap, missing, patience
 from tsdf.walk.lights import radiance as light_from
-from tsdf.walk.room import BOX, SLAB
-from tsdf.walk.sides import HAIR, depth, landing, logarithm, sides, way_in, way_out
+from tsdf.walk.room import BALL, BOX, SLAB
+from tsdf.walk.sides import HAIR, body_of, depth, landing, logarithm, sides, way_in, way_out
 from tsdf.walk.transport import aimed, carried, deflected, pixel_of, words_of
 from tsdf.walk.walker import (
     DIM,
@@ -61,7 +62,9 @@ class Lanes(NamedTuple):
     numbers (NUMBERS * STRIDE,), words (WORDS * STRIDE,) uint64, amounts (2 WIDTH + 1, a): of the lanes that walk, from
     0 on, and from WIDTH on of those that are about to, and room for a shadow's amounts. gone, ready, others (WIDTH,):
     lanes whose walk has ended, and of those that are about to, which do walk and which do not. counts (4,): lanes that
-    walk, the next sample, how many are ready, walkers handed over.
+    walk, the next sample, how many are ready, walkers handed over. body: what they walk in, see `sides.body_of`.
+    ends (samples, 10 + a): of those that find light, where they began, where they were last, which way they went from
+    there, weight and amounts; no rows where nobody asks.
     """
 
     numbers: np.ndarray
@@ -71,19 +74,22 @@ class Lanes(NamedTuple):
     ready: np.ndarray
     others: np.ndarray
     counts: np.ndarray
+    body: np.ndarray
+    ends: np.ndarray
 
 
 def suited(g: Geometry, media: Media) -> bool:
-    """Return whether nothing is in a scene but one medium in a box or slab, at a level that knows no packing."""
-    alone = len(g.kind) == 1 and g.kind[0] in (BOX, SLAB) and len(g.balls) == 0 and not g.engines
+    """Return whether nothing is in a scene but one medium in a box, slab or ball, at a level that knows no packing."""
+    alone = len(g.kind) == 1 and g.kind[0] in (BOX, SLAB, BALL) and len(g.balls) == 0 and not g.engines
     return alone and not media.traits.placed and not media.singles
 
 
-def lanes_of(amounts: int) -> Lanes:
-    """Return lanes without walkers, for so many amounts."""
+def lanes_of(g: Geometry, amounts: int, samples: int = 0) -> Lanes:
+    """Return lanes without walkers in the first medium, for so many amounts, that keep the ends of so many samples."""
     return Lanes(
         np.zeros(NUMBERS * STRIDE), np.zeros(WORDS * STRIDE, np.uint64), np.zeros((2 * WIDTH + 1, amounts)),
         np.zeros(WIDTH, np.int64), np.zeros(WIDTH, np.int64), np.zeros(WIDTH, np.int64), np.zeros(4, np.int64),
+        body_of(g), np.zeros((samples, 10 + amounts)),
     )  # fmt: skip
 
 
@@ -160,21 +166,24 @@ def begin(lanes, job, first, count):
         size = 1.0 / math.sqrt(dot(d, d))
         put(numbers, PX, i, step(step(origin, x, aside), y, below))
         put(numbers, DX, i, (d[0] * size, d[1] * size, d[2] * size))
+    for i in range(WIDTH, WIDTH + count if lanes.ends.shape[0] > 0 else WIDTH):
+        own = lanes.ends[words[at(SAMPLE, i)]]
+        own[0], own[1], own[2] = three(numbers, PX, i)
 
 
 @njit(**KERNEL)
 def arrive(g, leaps, lanes, count):
     """Bring the samples that are ready to where they come inside, or let them find light; see `transport.fly`."""
     numbers, words, slack = lanes.numbers, lanes.words, g.slack[0]
-    low, high = sides(g)
+    body = sides(lanes.body)
     for i in range(WIDTH, WIDTH + count):
         p, d = three(numbers, PX, i), three(numbers, DX, i)
-        near, each = way_in(low, high, p, d)
-        inside, met = depth(low, high, p) > 0.0, near < math.inf
+        near, each = way_in(body, p, d)
+        inside, met = depth(body, p) > 0.0, near < math.inf
         move = 0.0 if inside else (near + slack * min(abs(each), GRAZING) if met else 0.0)
         p = step(p, move, d)
         put(numbers, PX, i, p)
-        numbers[at(PDF, i)], numbers[at(FREE, i)], numbers[at(BOUND, i)] = -1.0, -1.0, depth(low, high, p)
+        numbers[at(PDF, i)], numbers[at(FREE, i)], numbers[at(BOUND, i)] = -1.0, -1.0, depth(body, p)
         numbers[at(LUCK, i)], numbers[at(WEIGHT, i)] = 0.0, 1.0
         words[at(MET, i)], words[at(ONCE, i)] = np.uint64(not inside), np.uint64(inside)
         words[at(STATE, i)] = np.uint64(WALKS) if inside or met else np.uint64(LIGHT)
@@ -206,7 +215,7 @@ def fly(world, lanes, first, last):
     """Take the lanes first .. last - 1 along a free path, to a grain or out; see `transport.wander`."""
     g, media, numbers, words = world.geometry, world.media, lanes.numbers, lanes.words
     mean, hair = media.free[0], HAIR * g.slack[0]
-    low, high = sides(g)
+    body = sides(lanes.body)
     most = np.uint64((media.limit if deep(world.leaps) else min(PATIENCE, media.limit)) - 1)
     for i in range(first, last):
         p, d = three(numbers, PX, i), three(numbers, DX, i)
@@ -215,7 +224,7 @@ def fly(world, lanes, first, last):
         key = key if drawn else key + GOLDEN
         free = free if drawn else -mean * logarithm(1.0 - unit(mix(key)))
         end = step(p, free, d)
-        there = depth(low, high, end)
+        there = depth(body, end)
         short = bound <= free
         walks = words[at(STATE, i)] == np.uint64(WALKS)
         lost = not bound > 0.0 or words[at(MET, i)] >= most
@@ -239,7 +248,7 @@ def fly(world, lanes, first, last):
         way = numbers[at(WAY, i)]
         if way < 0.0:  # out
             d = three(numbers, DX, i)
-            t, each, _ = way_out(low, high, three(numbers, PX, i), d, d)
+            t, each, _ = way_out(body, three(numbers, PX, i), d, d)
             way = t - HAIR * g.slack[0] * min(each, GRAZING)
         lanes.amounts[i, travel] += way
         numbers[at(LUCK, i)] += least * way
@@ -283,7 +292,7 @@ def land(world, lanes):
     there, out or in again."""
     g, numbers, words, leaps = world.geometry, lanes.numbers, lanes.words, world.leaps
     slack, scale = g.slack[0], world.media.scale[0]
-    low, high = sides(g)
+    body = sides(lanes.body)
     for i in range(lanes.counts[LIVE]):
         p, d = three(numbers, PX, i), three(numbers, DX, i)
         d, offset = leave(
@@ -291,11 +300,11 @@ def land(world, lanes):
         )
         d = renewed(d)
         offset = (scale * offset[0], scale * offset[1], scale * offset[2])
-        sure, out, p, left, back = landing(low, high, slack, p, offset, numbers[at(BOUND, i)], d)
+        sure, out, p, left, back = landing(body, slack, p, offset, numbers[at(BOUND, i)], d)
         anew = not sure or words[at(ONCE, i)] != np.uint64(0)  # `transport.wander` would begin again
         put(numbers, PX, i, p)
         put(numbers, DX, i, d)
-        numbers[at(BOUND, i)] = depth(low, high, p) if anew else left
+        numbers[at(BOUND, i)] = depth(body, p) if anew else left
         numbers[at(BACK, i)] = back
         numbers[at(WAITS, i)] = -1.0 if anew else numbers[at(WAITS, i)]
         words[at(MET, i)] += np.uint64(1)
@@ -366,10 +375,10 @@ def connect(world, batch, lanes):
     """Let light arrive from a light and be deflected into each lane's path by its grain; see `transport.connect`."""
     g, media, numbers, words = world.geometry, world.media, lanes.numbers, lanes.words
     mean, reach = media.free[0], media.reach[0]
-    low, high = sides(g)
+    body = sides(lanes.body)
     for i in range(lanes.counts[LIVE]):
         bound = numbers[at(BOUND, i)]
-        around = max(bound, depth(low, high, three(numbers, PX, i)))
+        around = max(bound, depth(body, three(numbers, PX, i)))
         numbers[at(BOUND, i)] = around if bound < 8.0 * mean else bound
         key = words[at(KEY, i)] + GOLDEN
         words[at(KEY, i)] = key
@@ -417,14 +426,14 @@ def shade(g, media, lanes):
     """Take light that is aimed from where it leaves its grain out of the medium: as COSINE what comes through, as WAY
     what it has flown, as BACK what part of the jump is beyond the boundary; see `transport.fly`."""
     numbers, scale, slack, mean = lanes.numbers, media.scale[0], g.slack[0], media.free[0]
-    low, high = sides(g)
+    body = sides(lanes.body)
     for i in range(lanes.counts[LIVE]):
         p, d, toward = three(numbers, PX, i), three(numbers, DX, i), three(numbers, TX, i)
         offset = carried(
             d, toward, numbers[at(COSINE, i)], numbers[at(R, i)], numbers[at(Z, i)], numbers[at(PHI, i)], scale
         )
-        _, out, p, _, back = landing(low, high, slack, p, offset, numbers[at(BOUND, i)], toward)
-        t, each, _ = way_out(low, high, p, toward, toward)
+        _, out, p, _, back = landing(body, slack, p, offset, numbers[at(BOUND, i)], toward)
+        t, each, _ = way_out(body, p, toward, toward)
         way = 0.0 if out else t - HAIR * slack * min(each, GRAZING)
         numbers[at(WAY, i)], numbers[at(BACK, i)] = way, back
         numbers[at(COSINE, i)] = power(-way / mean)
@@ -456,7 +465,14 @@ def settle(world, batch, lanes, i):
         light = world.lights.constant[0], world.lights.constant[1], world.lights.constant[2]
         if varied(world.lights):
             light = light_from(world.lights, three(numbers, DX, i), numbers[at(PDF, i)])
-        give(world, batch, lanes.words[at(SAMPLE, i)], amounts, numbers[at(WEIGHT, i)], light)
+        sample = lanes.words[at(SAMPLE, i)]
+        give(world, batch, sample, amounts, numbers[at(WEIGHT, i)], light)
+        if lanes.ends.shape[0] > 0:
+            own = lanes.ends[sample]
+            own[3], own[4], own[5] = three(numbers, PX, i)
+            own[6], own[7], own[8] = three(numbers, DX, i)
+            own[9] = numbers[at(WEIGHT, i)]
+            copy(own[10:], amounts)
     elif state == np.uint64(LOST):
         note(batch, lanes, i)
         copy(batch.amounts[lanes.counts[HANDED]], amounts)

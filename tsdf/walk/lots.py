@@ -12,8 +12,8 @@ import numpy as np
 from tsdf.compiled import njit
 from tsdf.vectors import KERNEL
 
-BLOCKS = 8  # bits of a lot that say how many blocks a cell has
-MOST_BLOCKS, MOST_ALL = 2**BLOCKS - 1, 2 ** (31 - BLOCKS)
+BITS = 8  # bits of a lot that say how many blocks a cell has
+MOST_BLOCKS, MOST_ALL = 2**BITS - 1, 2 ** (31 - BITS)
 PARALLEL = 1e-12  # component of a direction below which it never comes out of its cells' padding
 
 
@@ -21,7 +21,7 @@ class Lots(NamedTuple):
     """Cells (i n_y + j) n_z + k. For kernels.
 
     low (3,) float64: lowest corner; per_edge: cells per length; counts (3,) int64; lot (cells,) int32: of a cell that
-    has blocks, the first of them times 2^BLOCKS and how many, else minus the number of cells to the next that has any,
+    has blocks, the first of them times 2^BITS and how many, else minus the number of cells to the next that has any,
     in the maximum norm.
     """
 
@@ -114,6 +114,38 @@ def outside(lots, g):
 # ------------------------------------------------------------------------------------------------ making
 
 
+@njit(cache=True)
+def _filled(ends, counts, first, listed):
+    """Count the boxes that reach into each cell, from cell ends[:, 0] to the one before ends[:, 1] (n, 2, 3), in
+    first[1:], or with room for them write them to `listed`."""
+    at = first[:-1].copy()
+    for one in range(len(ends)):
+        for i in range(ends[one, 0, 0], ends[one, 1, 0]):
+            for j in range(ends[one, 0, 1], ends[one, 1, 1]):
+                for k in range(ends[one, 0, 2], ends[one, 1, 2]):
+                    cell = (i * counts[1] + j) * counts[2] + k
+                    if len(listed):
+                        listed[at[cell]] = one
+                        at[cell] += 1
+                    else:
+                        first[cell + 1] += 1
+
+
+def listed(
+    lows: np.ndarray, highs: np.ndarray, low: np.ndarray, edge: float, counts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a cell and a box of each pair of these that meet, by cells: boxes have corners (n, 3), the grid begins at
+    `low` and has cells of an edge, `counts` (3,) of them."""
+    ends = np.stack((np.floor((lows - low) / edge), np.floor((highs - low) / edge) + 1.0), axis=1)
+    ends = np.clip(ends, 0, counts).astype(np.int64)
+    first = np.zeros(int(counts.prod()) + 1, np.int64)
+    _filled(ends, counts, first, np.zeros(0, np.int64))
+    number, first = first[1:].copy(), np.cumsum(first)
+    found = np.zeros(int(first[-1]), np.int64)
+    _filled(ends, counts, first, found)
+    return np.repeat(np.arange(len(number)), number), found
+
+
 def lots_of(low: np.ndarray, per_edge: float, counts: np.ndarray, blocks: np.ndarray) -> Lots:
     """Return the cells of a grid that have so many blocks (cells,) each, MOST_BLOCKS at most, one after the other."""
     from scipy.ndimage import distance_transform_cdt
@@ -123,5 +155,5 @@ def lots_of(low: np.ndarray, per_edge: float, counts: np.ndarray, blocks: np.nda
     first = np.cumsum(blocks) - blocks
     if not (blocks > 0).any():  # then it is nowhere
         far = np.full(len(blocks), int(counts.max()))
-    lot = np.where(blocks > 0, first << BLOCKS | blocks, -far)
+    lot = np.where(blocks > 0, first << BITS | blocks, -far)
     return Lots(np.ascontiguousarray(low), float(per_edge), counts.astype(np.int64), lot.astype(np.int32))
