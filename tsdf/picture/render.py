@@ -24,7 +24,7 @@ from tsdf.handle import Handle
 from tsdf.picture.trust import SHOWN, Moments, Trust, kurtosis_of
 from tsdf.picture.world import World, camera_of, sees
 from tsdf.scene.levels import LEVELS
-from tsdf.walk import lanes, packed, standing, transport
+from tsdf.walk import bodies, lanes, packed, standing, transport
 from tsdf.walk import walker as W
 from tsdf.walk.hybrid import ALL
 from tsdf.walk.transport import CameraArrays
@@ -138,7 +138,10 @@ class Walkers:
         self.lanes = self.abreast = None
         if lanes.suited(world.place.arrays, world.media):
             self.lanes = lanes.lanes_of(world.amounts)
-            self.abreast = Handle(self.lanes)
+            self.abreast, self.stride = Handle(self.lanes), lanes.walk
+        elif bodies.suited(world.place.arrays, world.media):
+            crowd = bodies.crowd_of(world.amounts)
+            self.lanes, self.abreast, self.stride = crowd.lanes, Handle(crowd), bodies.walk
         self.radiance = np.zeros((BLOCK, 3))  # more than most need: to lay it out takes as long as 2000 samples
         self._lay_out()
 
@@ -189,7 +192,7 @@ class Walkers:
         counts = self.lanes.counts
         counts[:] = 0
         while (counts[lanes.LIVE] or counts[lanes.NEXT] < total) and not stop.is_set():
-            lanes.walk(self.arrays, self.batches[0], self.abreast, job, total)
+            self.stride(self.arrays, self.batches[0], self.abreast, job, total)
             live = int(counts[lanes.HANDED])
             while live and not stop.is_set():
                 live = self.turn(live)

@@ -335,24 +335,31 @@ def absorb(world, batch, lanes):
 
 
 @njit(**KERNEL)
+def soars(world, batch, lanes, i):
+    """Let a lane leap; return whether it has, and is to fly from there."""
+    numbers, words, w = lanes.numbers, lanes.words, note(batch, lanes, i)
+    later, bound = leap(world, batch, w, lanes.amounts[i])
+    numbers[at(WAITS, i)] = float(later)
+    if later == ENDS:
+        words[at(STATE, i)] = np.uint64(DEAD)
+    if later > LEAPT_ON or later == ENDS:
+        return False
+    put(numbers, PX, i, triple(w.p))
+    put(numbers, DX, i, triple(w.d))
+    words[at(KEY, i)], words[at(MET, i)] = w.key, np.uint64(w.events)
+    numbers[at(FREE, i)], numbers[at(LUCK, i)], numbers[at(PDF, i)] = w.free, w.luck, w.pdf
+    numbers[at(WEIGHT, i)], numbers[at(BOUND, i)] = w.weight, bound
+    return True
+
+
+@njit(**KERNEL)
 def soar(world, batch, lanes):
     """Let lanes leap that have come deep enough, see `leaps`; return whether any of them walks no more."""
     numbers, words, gone = lanes.numbers, lanes.words, False
     for i in range(lanes.counts[LIVE]):
         while words[at(STATE, i)] == np.uint64(WALKS) and numbers[at(WAITS, i)] <= 0.0:
-            w = note(batch, lanes, i)
-            later, bound = leap(world, batch, w, lanes.amounts[i])
-            numbers[at(WAITS, i)] = float(later)
-            if later > LEAPT_ON:
+            if not soars(world, batch, lanes, i):
                 break
-            if later == ENDS:
-                words[at(STATE, i)] = np.uint64(DEAD)
-                break
-            put(numbers, PX, i, triple(w.p))
-            put(numbers, DX, i, triple(w.d))
-            words[at(KEY, i)], words[at(MET, i)] = w.key, np.uint64(w.events)
-            numbers[at(FREE, i)], numbers[at(LUCK, i)], numbers[at(PDF, i)] = w.free, w.luck, w.pdf
-            numbers[at(WEIGHT, i)], numbers[at(BOUND, i)] = w.weight, bound
             fly(world, lanes, i, i + 1)
         gone |= words[at(STATE, i)] != np.uint64(WALKS)
     return gone
@@ -365,18 +372,34 @@ def soar(world, batch, lanes):
 def connect(world, batch, lanes):
     """Let light arrive from a light and be deflected into each lane's path by its grain; see `transport.connect`."""
     g, media, numbers, words = world.geometry, world.media, lanes.numbers, lanes.words
-    mean, reach = media.free[0], media.reach[0]
+    mean = media.free[0]
     low, high = sides(g)
     for i in range(lanes.counts[LIVE]):
         bound = numbers[at(BOUND, i)]
         around = max(bound, depth(low, high, three(numbers, PX, i)))
         numbers[at(BOUND, i)] = around if bound < 8.0 * mean else bound
-        key = words[at(KEY, i)] + GOLDEN
-        words[at(KEY, i)] = key
-        numbers[at(COSINE, i)] = unit(mix(key))
-        key = mix(key ^ OTHER)
-        words[at(ONE, i)], words[at(TWO, i)] = key, mix(key + GOLDEN)
-        words[at(BITS, i)], words[at(MORE, i)] = mix(key + GOLDEN + GOLDEN), mix(key + GOLDEN + GOLDEN + GOLDEN)
+        lot(numbers, words, i)
+    beam(world, lanes)
+    shade(g, media, lanes)
+    light(world, batch, lanes)
+
+
+@njit(forceinline=True, **KERNEL)
+def lot(numbers, words, i):
+    """Draw what light that is aimed at a lane needs: as COSINE whether any is, and four words."""
+    key = words[at(KEY, i)] + GOLDEN
+    words[at(KEY, i)] = key
+    numbers[at(COSINE, i)] = unit(mix(key))
+    key = mix(key ^ OTHER)
+    words[at(ONE, i)], words[at(TWO, i)] = key, mix(key + GOLDEN)
+    words[at(BITS, i)], words[at(MORE, i)] = mix(key + GOLDEN + GOLDEN), mix(key + GOLDEN + GOLDEN + GOLDEN)
+
+
+@njit(**KERNEL)
+def beam(world, lanes):
+    """Draw the light that is aimed at each lane: as AIMED whether there is any."""
+    media, numbers, words = world.media, lanes.numbers, lanes.words
+    mean, reach = media.free[0], media.reach[0]
     for i in range(lanes.counts[LIVE]):
         c, bound, weight = np.int64(words[at(KIND, i)]), numbers[at(BOUND, i)], 0.0
         share = math.exp((reach - bound) / mean) if reach < bound else 1.0
@@ -391,7 +414,12 @@ def connect(world, batch, lanes):
             weight *= numbers[at(WEIGHT, i)] / share
             put(numbers, RED, i, (light[0] * weight, light[1] * weight, light[2] * weight))
         words[at(AIMED, i)] = np.uint64(weight > 0.0)
-    shade(g, media, lanes)
+
+
+@njit(**KERNEL)
+def light(world, batch, lanes):
+    """Give samples the light that is aimed and comes through, see `shade`."""
+    media, numbers, words = world.media, lanes.numbers, lanes.words
     for i in range(lanes.counts[LIVE]):
         if words[at(AIMED, i)] == np.uint64(0):
             continue
@@ -480,6 +508,13 @@ def welcome(world, batch, lanes, job, count):
     lanes.counts[NEXT] += count
     arrive(world.geometry, world.leaps, lanes, count)
     fly(world, lanes, WIDTH, WIDTH + count)
+    for k in range(sort(lanes, count)):
+        settle(world, batch, lanes, lanes.others[k])
+
+
+@njit(**KERNEL)
+def sort(lanes, count):
+    """List which samples that are about to walk do, and which do not; return how many do not."""
     ready, other = 0, 0
     for i in range(WIDTH, WIDTH + count):
         walks = lanes.words[at(STATE, i)] == np.uint64(WALKS)
@@ -487,8 +522,7 @@ def welcome(world, batch, lanes, job, count):
         lanes.others[other] = i
         ready, other = ready + walks, other + (not walks)
     lanes.counts[READY] = ready
-    for k in range(other):
-        settle(world, batch, lanes, lanes.others[k])
+    return other
 
 
 @njit(forceinline=True, **KERNEL)
@@ -498,20 +532,20 @@ def crowded(batch, lanes):
 
 
 @njit(**KERNEL)
-def relieve(world, batch, lanes, job, total):
-    """Settle the lanes that walk no more and let others have their place."""
-    counts, gone = lanes.counts, 0
-    for i in range(counts[LIVE]):
+def ended(lanes):
+    """List the lanes that walk no more; return how many."""
+    gone = 0
+    for i in range(lanes.counts[LIVE]):
         lanes.gone[gone] = i
         gone += lanes.words[at(STATE, i)] != np.uint64(WALKS)
-    for k in range(gone):
-        settle(world, batch, lanes, lanes.gone[k])
-    while gone > 0 or counts[LIVE] < WIDTH:
-        if counts[READY] == 0:
-            if counts[NEXT] == total or crowded(batch, lanes):
-                break
-            welcome(world, batch, lanes, job, min(WIDTH, total - counts[NEXT]))
-            continue
+    return gone
+
+
+@njit(**KERNEL)
+def replace(lanes, gone):
+    """Let those that are ready take the places of those that are gone, and others; return how many are still gone."""
+    counts = lanes.counts
+    while counts[READY] > 0 and (gone > 0 or counts[LIVE] < WIDTH):
         counts[READY] -= 1
         if gone > 0:
             gone -= 1
@@ -520,11 +554,31 @@ def relieve(world, batch, lanes, job, total):
             to = counts[LIVE]
             counts[LIVE] += 1
         move(lanes, lanes.ready[counts[READY]], to)
+    return gone
+
+
+@njit(**KERNEL)
+def close(lanes, gone):
+    """Let others have the places of those that are gone, for nobody is ready any more."""
+    counts = lanes.counts
     while gone > 0:
         gone -= 1
         counts[LIVE] -= 1
         if lanes.gone[gone] < counts[LIVE]:
             move(lanes, counts[LIVE], lanes.gone[gone])
+
+
+@njit(**KERNEL)
+def relieve(world, batch, lanes, job, total):
+    """Settle the lanes that walk no more and let others have their place."""
+    counts, gone = lanes.counts, ended(lanes)
+    for k in range(gone):
+        settle(world, batch, lanes, lanes.gone[k])
+    gone = replace(lanes, gone)
+    while (gone > 0 or counts[LIVE] < WIDTH) and counts[NEXT] < total and not crowded(batch, lanes):
+        welcome(world, batch, lanes, job, min(WIDTH, total - counts[NEXT]))
+        gone = replace(lanes, gone)
+    close(lanes, gone)
 
 
 @njit(**KERNEL)
