@@ -87,7 +87,7 @@ def suited(g: Geometry, media: Media) -> bool:
 def crowd_of(amounts: int) -> Crowd:
     """Return lanes without walkers, for so many amounts."""
     lists = [np.zeros(2 * WIDTH, np.int64) for _ in range(4)]
-    return Crowd(lanes_of(amounts), ways_of(2 * WIDTH, 1), *lists)
+    return Crowd(lanes_of(amounts), ways_of(2 * WIDTH), *lists)
 
 
 @njit(forceinline=True, **KERNEL)

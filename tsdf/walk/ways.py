@@ -1,12 +1,11 @@
 """Facets that many ways meet, asked together: what `grid.march` says of one, for walkers in lanes.
 
 A way through a grid reads a cell, which says whether to read what is in it, which says which facets to read: each waits
-for the one before, and ends in a branch that nobody guesses. Here each of these is done for all ways that have come to
-it, one after the other in a loop without branches, so that a processor waits for many of them at once; what is read
+for the one before, and ends in a branch that nobody guesses. Here all ways do the same at a time, in loops without
+branches: the compiler works out several steps at once, and a processor waits for many of them together; what is read
 next is fetched meanwhile. A way ends where it meets its first facet, or leaves the grid: outside there must be none.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -14,73 +13,55 @@ import numpy as np
 from tsdf.compiled import fetch, njit
 from tsdf.vectors import KERNEL, dot, step, triple
 from tsdf.walk.cells import FEW, SIDES
-from tsdf.walk.grid import BEYOND, NONE, box_around, boxed, compared, inverse
+from tsdf.walk.grid import BEYOND, NONE, box_around, compared, inverse
+from tsdf.walk.lanes import STRIDE, at, put, three
 
 PAIRS = 1024  # of ways and facets that are looked at together
 PART = 64  # of a list, that is looked through at once
 
-# Numbers of a way: from where, whither, how far; how far it has gone, and goes at most; where it leaves its cell along
-# each axis, how far that is from wall to wall, and how many cells it comes for each unit
-PX, PY, PZ, DX, DY, DZ, END, GONE, LAST, TX, TY, TZ, IX, IY, IZ, CX, CY, CZ, FROM = range(19)
-NUMBERS, WHOLES = 24, 8  # of each way
-CELL, NX, NY, NZ, THERE = range(5)  # its cell, and to which it comes next along each axis; the one before
+# Numbers of a way: from where, whither, how far at most; how far it has come, and had before; where it leaves its cell
+# along each axis, how far that is from wall to wall, and how many cells it comes for each unit
+PX, PY, PZ, DX, DY, DZ, END, GONE, FROM, TX, TY, TZ, IX, IY, IZ, CX, CY, CZ, NX, NY, NZ, NUMBERS = range(22)
+CELL, THERE, FAR, NAME, WHOLES = range(5)
 
 
 class Ways(NamedTuple):
     """Ways from places, and what they meet.
 
-    numbers (n * NUMBERS,), wholes (n * WHOLES,) int64; facets (n, meshes) int32: the first facet met of each mesh, or NONE;
-    live, near, sought (n,): those that are under way, in a cell with facets, and may meet one there; lists (n, 8): of
-    these the list and which part of it; pairs (PAIRS, 2): a way and a facet.
+    numbers (NUMBERS * STRIDE,), wholes (WHOLES * STRIDE,) int64: of the ways that are under way, from 0 on; facets (n,
+    1) int32: the first facet that each meets, or NONE; near (n,): those in a cell with facets, last (n,):
+    room for others; pairs (PAIRS, 2): a way
+    and a facet.
     """
 
     numbers: np.ndarray
     wholes: np.ndarray
     facets: np.ndarray
-    live: np.ndarray
     near: np.ndarray
+    last: np.ndarray
     pairs: np.ndarray
 
 
-def ways_of(size: int, meshes: int) -> Ways:
-    """Return room for so many ways among the facets of so many meshes."""
+def ways_of(size: int) -> Ways:
+    """Return room for so many ways, at most STRIDE."""
     return Ways(
-        np.zeros(NUMBERS * size), np.zeros(WHOLES * size, np.int64), np.full((size, meshes), NONE, np.int32),
+        np.zeros(NUMBERS * STRIDE), np.zeros(WHOLES * STRIDE, np.int64), np.full((size, 1), NONE, np.int32),
         np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros((PAIRS, 2), np.int64),
     )  # fmt: skip
 
 
 @njit(forceinline=True, **KERNEL)
-def at(i, field):
-    """Return where a number of a way is."""
-    return np.uint64(i) * np.uint64(NUMBERS) + np.uint64(field)
-
-
-@njit(forceinline=True, **KERNEL)
-def on(i, field):
-    """Return where a whole number of a way is."""
-    return np.uint64(i) * np.uint64(WHOLES) + np.uint64(field)
-
-
-@njit(forceinline=True, **KERNEL)
-def place(numbers, i):
-    """Return from where a way goes."""
-    return numbers[at(i, PX)], numbers[at(i, PY)], numbers[at(i, PZ)]
-
-
-@njit(forceinline=True, **KERNEL)
-def course(numbers, i):
-    """Return whither a way goes."""
-    return numbers[at(i, DX)], numbers[at(i, DY)], numbers[at(i, DZ)]
-
-
-@njit(forceinline=True, **KERNEL)
 def lay(ways, i, p, d, end):
     """Write a way from p along d up to a distance."""
-    numbers = ways.numbers
-    numbers[at(i, PX)], numbers[at(i, PY)], numbers[at(i, PZ)] = p
-    numbers[at(i, DX)], numbers[at(i, DY)], numbers[at(i, DZ)] = d
-    numbers[at(i, END)] = end
+    put(ways.numbers, PX, i, p)
+    put(ways.numbers, DX, i, d)
+    ways.numbers[at(END, i)] = end
+
+
+@njit(forceinline=True, **KERNEL)
+def clipped(x, most):
+    """Return x rounded down to a cell of a row."""
+    return float(np.int64(min(max(x, 0.0), most)))
 
 
 @njit(**KERNEL)
@@ -89,65 +70,84 @@ def begin(grid, ways, count):
     numbers, wholes, size = ways.numbers, ways.wholes, 1.0 / grid.edge
     nx, ny, nz = grid.shape[0], grid.shape[1], grid.shape[2]
     lx, ly, lz = grid.low[0], grid.low[1], grid.low[2]
-    fx, fy, fz, hair = float(nx), float(ny), float(nz), 1e-8 * grid.edge
+    fx, fy, fz, hair, margin = float(nx), float(ny), float(nz), 1e-8 * grid.edge, grid.margin
     for i in range(count):
-        x, y, z = (numbers[at(i, PX)] - lx) * size, (numbers[at(i, PY)] - ly) * size, (numbers[at(i, PZ)] - lz) * size
-        dx, dy, dz = numbers[at(i, DX)] * size, numbers[at(i, DY)] * size, numbers[at(i, DZ)] * size
+        x, y, z = three(numbers, PX, i)
+        x, y, z = (x - lx) * size, (y - ly) * size, (z - lz) * size
+        dx, dy, dz = three(numbers, DX, i)
+        dx, dy, dz = dx * size, dy * size, dz * size
         ix, iy, iz = inverse(dx), inverse(dy), inverse(dz)
         ax, ay, az, bx, by, bz = -x * ix, -y * iy, -z * iz, (fx - x) * ix, (fy - y) * iy, (fz - z) * iz
         t = max(max(min(ax, bx), min(ay, by)), max(min(az, bz), 0.0))
         last = min(max(ax, bx), min(max(ay, by), max(az, bz)))
-        i0 = min(max(float(np.int64(min(max(x + t * dx, 0.0), fx))), 0.0), fx - 1.0)
-        j0 = min(max(float(np.int64(min(max(y + t * dy, 0.0), fy))), 0.0), fy - 1.0)
-        k0 = min(max(float(np.int64(min(max(z + t * dz, 0.0), fz))), 0.0), fz - 1.0)
-        wholes[on(i, CELL)] = (np.int64(i0) * ny + np.int64(j0)) * nz + np.int64(k0)
-        wholes[on(i, NX)] = ny * nz if dx >= 0.0 else -ny * nz
-        wholes[on(i, NY)] = nz if dy >= 0.0 else -nz
-        wholes[on(i, NZ)] = 1 if dz >= 0.0 else -1
-        numbers[at(i, TX)] = (i0 + (1.0 if dx >= 0.0 else 0.0) - x) * ix
-        numbers[at(i, TY)] = (j0 + (1.0 if dy >= 0.0 else 0.0) - y) * iy
-        numbers[at(i, TZ)] = (k0 + (1.0 if dz >= 0.0 else 0.0) - z) * iz
-        numbers[at(i, IX)], numbers[at(i, IY)], numbers[at(i, IZ)] = abs(ix), abs(iy), abs(iz)
-        numbers[at(i, CX)], numbers[at(i, CY)], numbers[at(i, CZ)] = max(abs(dx), 1e-300), max(abs(dy), 1e-300), max(abs(dz), 1e-300)
-        numbers[at(i, GONE)], numbers[at(i, LAST)] = t, last - hair - 1e-13 * last
-    margin, live, cells = grid.margin, 0, grid.far.shape[0]
+        i0, j0, k0 = clipped(x + t * dx, fx - 1.0), clipped(y + t * dy, fy - 1.0), clipped(z + t * dz, fz - 1.0)
+        wholes[at(CELL, i)] = (np.int64(i0) * ny + np.int64(j0)) * nz + np.int64(k0)
+        put(numbers, NX, i, (fy * fz if dx >= 0.0 else -fy * fz, fz if dy >= 0.0 else -fz, 1.0 if dz >= 0.0 else -1.0))
+        wholes[at(NAME, i)] = i
+        numbers[at(TX, i)] = (i0 + (1.0 if dx >= 0.0 else 0.0) - x) * ix
+        numbers[at(TY, i)] = (j0 + (1.0 if dy >= 0.0 else 0.0) - y) * iy
+        numbers[at(TZ, i)] = (k0 + (1.0 if dz >= 0.0 else 0.0) - z) * iz
+        put(numbers, IX, i, (abs(ix), abs(iy), abs(iz)))
+        put(numbers, CX, i, (max(abs(dx), 1e-300), max(abs(dy), 1e-300), max(abs(dz), 1e-300)))
+        numbers[at(GONE, i)] = t
+        numbers[at(END, i)] = min(numbers[at(END, i)] + margin, last - hair - 1e-13 * last)
     for i in range(count):
-        numbers[at(i, END)] += margin
-        for e in range(ways.facets.shape[1]):
-            ways.facets[i, e] = NONE
-        ways.live[np.uint64(live)] = i
-        live += (numbers[at(i, GONE)] <= min(numbers[at(i, LAST)], numbers[at(i, END)])) & (0 <= wholes[on(i, CELL)] < cells)
-    return live
+        ways.facets[i, 0] = NONE
 
 
 @njit(**KERNEL)
-def advance(grid, ways, live):
-    """Take ways that are under way past their cells; return how many go on, and how many were in cells with facets."""
-    numbers, wholes, near, going, cells = ways.numbers, ways.wholes, 0, 0, grid.far.shape[0]
-    for k in range(live):
-        i = ways.live[np.uint64(k)]
-        cell = wholes[on(i, CELL)]
-        far = np.int64(grid.far[np.uint64(cell)]) >> 8
+def gaze(grid, ways, count):
+    """See how far facets are from the ways' cells, -1 for those that have come to their end, and list those in cells
+    with facets; return how many, and how many ways are under way."""
+    wholes, numbers, near, goes, cells = ways.wholes, ways.numbers, 0, 0, grid.far.shape[0]
+    for i in range(count):
+        cell = wholes[at(CELL, i)]
+        on = (numbers[at(GONE, i)] <= numbers[at(END, i)]) & (cell >= 0) & (cell < cells)
+        far = np.int64(grid.far[np.uint64(cell if on else 0)]) >> 8
+        far = far if on else -1
+        wholes[at(FAR, i)] = far
         ways.near[np.uint64(near)] = i
-        wholes[on(i, THERE)], numbers[at(i, FROM)] = cell, numbers[at(i, GONE)]
         near += far == 0
-        f = float(max(far, 1) - 1)
-        tx, ty, tz = numbers[at(i, TX)], numbers[at(i, TY)], numbers[at(i, TZ)]
-        ix, iy, iz = numbers[at(i, IX)], numbers[at(i, IY)], numbers[at(i, IZ)]
+        goes += on
+    return near, goes
+
+
+@njit(**KERNEL)
+def advance(ways, count):
+    """Take ways past their cells."""
+    numbers, wholes = ways.numbers, ways.wholes
+    for i in range(count):
+        cell = wholes[at(CELL, i)]
+        wholes[at(THERE, i)], numbers[at(FROM, i)] = cell, numbers[at(GONE, i)]
+        f = float(max(wholes[at(FAR, i)], 1) - 1)
+        tx, ty, tz = three(numbers, TX, i)
+        ix, iy, iz = three(numbers, IX, i)
         t = min(tx + f * ix, min(ty + f * iy, tz + f * iz))
-        n = np.int64(max((t - tx) * numbers[at(i, CX)] + BEYOND, 0.0))
-        numbers[at(i, TX)] = tx + n * ix
-        cell += n * wholes[on(i, NX)]
-        n = np.int64(max((t - ty) * numbers[at(i, CY)] + BEYOND, 0.0))
-        numbers[at(i, TY)] = ty + n * iy
-        cell += n * wholes[on(i, NY)]
-        n = np.int64(max((t - tz) * numbers[at(i, CZ)] + BEYOND, 0.0))
-        numbers[at(i, TZ)] = tz + n * iz
-        cell += n * wholes[on(i, NZ)]
-        wholes[on(i, CELL)], numbers[at(i, GONE)] = cell, t
-        ways.live[np.uint64(going)] = i
-        going += (t <= min(numbers[at(i, LAST)], numbers[at(i, END)])) & (0 <= cell < cells)
-    return going, near
+        x = float(np.int64(max((t - tx) * numbers[at(CX, i)] + BEYOND, 0.0)))
+        y = float(np.int64(max((t - ty) * numbers[at(CY, i)] + BEYOND, 0.0)))
+        z = float(np.int64(max((t - tz) * numbers[at(CZ, i)] + BEYOND, 0.0)))
+        put(numbers, TX, i, (tx + x * ix, ty + y * iy, tz + z * iz))
+        cell += np.int64(x * numbers[at(NX, i)] + y * numbers[at(NY, i)] + z * numbers[at(NZ, i)])
+        wholes[at(CELL, i)] = cell if wholes[at(FAR, i)] >= 0 else -1
+        numbers[at(GONE, i)] = t
+
+
+@njit(**KERNEL)
+def close(ways, count, goes):
+    """Let ways that are under way, so many of the first `count`, take the places of those that are not."""
+    numbers, wholes, holes, others = ways.numbers, ways.wholes, 0, 0
+    for i in range(goes):
+        ways.near[np.uint64(holes)] = i
+        holes += wholes[at(FAR, i)] < 0
+    for i in range(goes, count):
+        ways.last[np.uint64(others)] = i
+        others += wholes[at(FAR, i)] >= 0
+    for field in range(NUMBERS):
+        for k in range(holes):
+            numbers[at(field, ways.near[np.uint64(k)])] = numbers[at(field, ways.last[np.uint64(k)])]
+    for field in range(WHOLES):
+        for k in range(holes):
+            wholes[at(field, ways.near[np.uint64(k)])] = wholes[at(field, ways.last[np.uint64(k)])]
 
 
 @njit(**KERNEL)
@@ -155,83 +155,84 @@ def sift(grid, ways, near):
     """Of ways in cells with facets leave those that may meet one, see `grid.asked`; return how many."""
     numbers, wholes, left = ways.numbers, ways.wholes, 0
     for k in range(near):
-        wholes[on(ways.near[np.uint64(k)], THERE)] = np.int64(grid.cells[wholes[on(ways.near[np.uint64(k)], THERE)]])
+        i = ways.near[np.uint64(k)]
+        number = np.int64(grid.cells[np.uint64(wholes[at(THERE, i)])])
+        wholes[at(FAR, i)] = number
+        fetch(grid.slabs[number:])
     for k in range(near):
         i = ways.near[np.uint64(k)]
-        slab = grid.slabs[wholes[on(i, THERE)]]
+        slab = grid.slabs[np.uint64(wholes[at(FAR, i)])]
         n = triple(slab.way)
-        high, by = dot(n, place(numbers, i)), dot(n, course(numbers, i))
-        a = high + numbers[at(i, FROM)] * by
-        b = high + min(numbers[at(i, GONE)], numbers[at(i, END)]) * by
+        level, by = dot(n, three(numbers, PX, i)), dot(n, three(numbers, DX, i))
+        a = level + numbers[at(FROM, i)] * by
+        b = level + min(numbers[at(GONE, i)], numbers[at(END, i)]) * by
         ways.near[np.uint64(left)] = i
         left += (min(a, b) <= slab.high) & (max(a, b) >= slab.low)
     return left
 
 
 @njit(**KERNEL)
-def search(grid, ways, near, before):
+def search(grid, ways, near):
     """Note which facets ways meet in their cells."""
     numbers, wholes, pairs, count = ways.numbers, ways.wholes, ways.pairs, 0
     for k in range(near):
-        fetch(grid.listed[grid.slabs[wholes[on(ways.near[np.uint64(k)], THERE)]].first])
+        fetch(grid.listed[grid.slabs[wholes[at(FAR, ways.near[np.uint64(k)])]].first])
     for k in range(near):
         i = ways.near[np.uint64(k)]
-        slab = grid.slabs[wholes[on(i, THERE)]]
+        slab = grid.slabs[np.uint64(wholes[at(FAR, i)])]
         here, there, box = int(slab.first), int(slab.last), (0, SIDES - 1, 0, SIDES - 1)
         if there - here > FEW:
-            n, p, d = triple(slab.way), place(numbers, i), course(numbers, i)
-            each, high = inverse(dot(n, d)), dot(n, p)
-            low, far = numbers[at(i, FROM)], min(numbers[at(i, GONE)], numbers[at(i, END)])
-            a, b = (slab.low - high) * each, (slab.high - high) * each
-            a, b = max(low, min(a, b)), min(far, max(a, b))
-            middle = step(p, 0.5 * (low + numbers[at(i, GONE)]), d)
-            box = box_around(grid, cell_of(grid, middle), n, step(p, a, d), step(p, b, d))
+            n, p, d = triple(slab.way), three(numbers, PX, i), three(numbers, DX, i)
+            each, level = inverse(dot(n, d)), dot(n, p)
+            a, b = (slab.low - level) * each, (slab.high - level) * each
+            low, high = numbers[at(FROM, i)], min(numbers[at(GONE, i)], numbers[at(END, i)])
+            a, b = max(low, min(a, b)), min(high, max(a, b))
+            box = box_around(grid, wholes[at(THERE, i)], n, step(p, a, d), step(p, b, d))
         while here < there:
             end = min(there, here + PART)
             if count + PART > PAIRS:
                 compare(grid, ways, count)
                 count = 0
-            for k2 in range(here, end):
-                pairs[np.uint64(count), 0], pairs[np.uint64(count), 1] = i, grid.listed[np.uint64(k2), 0]
-                count += boxed_both(box, grid.listed[np.uint64(k2), 1])
+            for place in range(here, end):
+                facet, its = grid.listed[np.uint64(place), 0], grid.listed[np.uint64(place), 1]
+                pairs[np.uint64(count), 0], pairs[np.uint64(count), 1] = i, facet
+                u = (box[0] <= (its >> 8 & 255)) & (box[1] >= (its & 255))
+                count += u & (box[2] <= (its >> 24 & 255)) & (box[3] >= (its >> 16 & 255))
             here = end
-    for k in range(count):
-        fetch(grid.facets[pairs[k, 1]])
-        fetch(grid.facets[pairs[k, 1], 8:])
     compare(grid, ways, count)
-
-
-@njit(forceinline=True, **KERNEL)
-def boxed_both(box, its):
-    """Return what `grid.boxed` does, without a branch."""
-    u = (box[0] <= (its >> 8 & 255)) & (box[1] >= (its & 255))
-    return u & (box[2] <= (its >> 24 & 255)) & (box[3] >= (its >> 16 & 255))
-
-
-@njit(forceinline=True, **KERNEL)
-def cell_of(grid, p):
-    """Return the number of the cell that p is in."""
-    by = 1.0 / grid.edge
-    i, j, k = int((p[0] - grid.low[0]) * by), int((p[1] - grid.low[1]) * by), int((p[2] - grid.low[2]) * by)
-    return (i * grid.shape[1] + j) * grid.shape[2] + k
 
 
 @njit(**KERNEL)
 def compare(grid, ways, count):
-    """Note the facets of pairs that are the first that their ways meet."""
-    numbers = ways.numbers
+    """Note the facets of pairs that are the first that their ways meet; see `grid.compared`."""
+    numbers, pairs, facets, left = ways.numbers, ways.pairs, grid.facets, 0
     for k in range(count):
-        i, facet = ways.pairs[k, 0], ways.pairs[k, 1]
-        p, d, end = place(numbers, i), course(numbers, i), numbers[at(i, END)]
-        numbers[at(i, END)] = min(end, compared(grid, ways.facets[i], NONE, facet, p, d, end) + grid.margin)
+        fetch(facets[pairs[np.uint64(k), 1]])
+        fetch(facets[pairs[np.uint64(k), 1], 8:])
+    for k in range(count):
+        i, f = pairs[np.uint64(k), 0], pairs[np.uint64(k), 1]
+        n = (facets[np.uint64(f), 0], facets[np.uint64(f), 1], facets[np.uint64(f), 2])
+        cosine = dot(n, three(numbers, DX, i))
+        height = facets[np.uint64(f), 3] - dot(n, three(numbers, PX, i))
+        pairs[np.uint64(left), 0], pairs[np.uint64(left), 1] = i, f
+        left += (height * cosine >= 0.0) & (abs(height) <= numbers[at(END, i)] * abs(cosine))
+    for k in range(left):
+        i, f = pairs[np.uint64(k), 0], pairs[np.uint64(k), 1]
+        p, d = three(numbers, PX, i), three(numbers, DX, i)
+        end, met = numbers[at(END, i)], ways.facets[ways.wholes[at(NAME, i)]]
+        numbers[at(END, i)] = min(end, compared(grid, met, NONE, f, p, d, end) + grid.margin)
 
 
 @njit(**KERNEL)
 def meet(grid, ways, count):
-    """Note in `facets` of the first `count` ways which they meet first; what is farther than their end may be missing."""
-    live = begin(grid, ways, count)
-    while live > 0:
-        live, near = advance(grid, ways, live)
+    """Note in `facets` which the first `count` ways meet first; what is farther than their end may be missing."""
+    begin(grid, ways, count)
+    while count > 0:
+        near, goes = gaze(grid, ways, count)
+        advance(ways, count)
         near = sift(grid, ways, near)
         if near > 0:
-            search(grid, ways, near, 0)
+            search(grid, ways, near)
+        if 2 * goes <= count:
+            close(ways, count, goes)
+            count = goes
