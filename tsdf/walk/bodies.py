@@ -34,6 +34,7 @@ from tsdf.walk.lanes import (
     LOST,
     LUCK,
     MET,
+    MORE,
     NEXT,
     ONCE,
     ONE,
@@ -61,7 +62,7 @@ from tsdf.walk.transport import GRAZING, UNKNOWN, beyond, carried
 from tsdf.walk.walker import EVENTS, FAINT, PATIENCE, Media, power
 from tsdf.walk.ways import Ways, lay, meet, ways_of
 
-OUTSIDE, STRAY = 4, 5  # more of `lanes.STATE`: it is outside and may come back, or alone will know where it is
+OUTSIDE, STRAY, ENTERED = 4, 5, 3  # more of `lanes.STATE`: it is outside and may come back, or alone will know where it is
 FRESH = -2.0  # FREE of a lane that has not flown since it was found how far it is from all facets
 
 
@@ -130,13 +131,10 @@ def enter(world, crowd, count, fresh):
             p = step(p, t + beyond(slack, cosine), d)
             put(numbers, PX, i, p)
             words[at(MET, i)] += np.uint64(1)
-            if home_of(grid, ways.facets[k], p) != 0:
-                words[at(STATE, i)] = np.uint64(STRAY)
-                continue
-            numbers[at(BOUND, i)], words[at(ONCE, i)] = free_around(grid, p, 0.0), np.uint64(0)
+            numbers[at(BOUND, i)], words[at(ONCE, i)] = free_around(grid, p, 0.0), np.uint64(ENTERED)
         words[at(STATE, i)], numbers[at(FREE, i)] = np.uint64(WALKS), FRESH
         if deep(world.leaps):
-            numbers[at(WAITS, i)] = wait(world.leaps, words[at(ONCE, i)], numbers[at(BOUND, i)])
+            numbers[at(WAITS, i)] = wait(world.leaps, np.uint64(cosine > 0.0), numbers[at(BOUND, i)])
         crowd.flying[inside] = i
         inside += 1
     return inside
@@ -186,20 +184,20 @@ def bounded(world, crowd, count):
     for k in range(count):
         i = crowd.flying[k]
         bound[limited] = i
-        limited += numbers[at(BOUND, i)] <= numbers[at(FREE, i)]
+        limited += (numbers[at(BOUND, i)] <= numbers[at(FREE, i)]) | (words[at(ONCE, i)] == np.uint64(ENTERED))
     ways = 0
     for k in range(limited):
         i = bound[k]
         p, free = three(numbers, PX, i), numbers[at(FREE, i)]
-        once = words[at(ONCE, i)] != np.uint64(0)
-        if words[at(AIMED, i)] == np.uint64(0) and not once:
+        once, d = words[at(ONCE, i)], three(numbers, DX, i)
+        if words[at(AIMED, i)] == np.uint64(0) and once == np.uint64(0):
             numbers[at(BOUND, i)] = free_around(g.grid, p, free)
             if numbers[at(BOUND, i)] > free:
                 continue
-        d = three(numbers, DX, i)
-        if g.convex and held(g.grid, 0, step(p, free, d)):
+        entered = once == np.uint64(ENTERED)
+        if not entered and g.convex and held(g.grid, 0, step(p, free, d)):
             continue
-        lay(crowd.ways, ways, p, d, free)
+        lay(crowd.ways, ways, p, d, math.inf if entered else free)
         bound[ways] = i
         ways += 1
     return ways
@@ -222,13 +220,15 @@ def fly(world, crowd, count):
         numbers[at(WAITS, i)] -= 1.0
     for k in range(limited):
         i, facet = crowd.bound[k], ways.facets[k, 0]
-        if facet == NONE or words[at(STATE, i)] != np.uint64(WALKS):
+        entered = words[at(ONCE, i)] == np.uint64(ENTERED)
+        if words[at(STATE, i)] != np.uint64(WALKS) or (facet == NONE and not entered):
             continue
         p, d = three(numbers, PX, i), three(numbers, DX, i)
-        t, cosine, _, slack = found(grid, facet, p, d)
-        if not cosine > 0.0:
-            words[at(STATE, i)], numbers[at(WAY, i)] = np.uint64(LOST), 0.0
+        t, cosine, _, slack = found(grid, max(facet, 0), p, d)
+        if facet == NONE or not cosine > 0.0:
+            words[at(STATE, i)], numbers[at(WAY, i)] = np.uint64(STRAY if entered else LOST), 0.0
             continue
+        words[at(ONCE, i)] = np.uint64(0 if entered else words[at(ONCE, i)])
         move = beyond(slack, cosine)
         if numbers[at(FREE, i)] < t - HAIR * move:
             continue
@@ -244,7 +244,7 @@ def fly(world, crowd, count):
         p = step(three(numbers, PX, i), free if walks else 0.0, three(numbers, DX, i))
         put(numbers, PX, i, p)
         numbers[at(BOUND, i)] -= free
-        numbers[at(FREE, i)] = -1.0 if walks else free
+        numbers[at(FREE, i)] = free if words[at(STATE, i)] == np.uint64(LOST) else -1.0
     travel = media.travel[0]
     if travel >= 0:
         least = world.absorption.least[travel]
@@ -380,7 +380,7 @@ def jump(world, crowd):
         size, end = math.sqrt(dot(offset, offset)), step(p, 1.0, offset)
         put(numbers, R, i, end)
         numbers[at(COSINE, i)], numbers[at(WAY, i)], numbers[at(BACK, i)] = 1.0, 0.0, 0.0
-        words[at(BITS, i)] = words[at(ONE, i)] + used
+        words[at(BITS, i)], words[at(MORE, i)] = words[at(ONE, i)] + used, np.uint64(0)
         if size < numbers[at(BOUND, i)] or size == 0.0 or (g.convex and held(grid, 0, end)):
             crowd.inner[inner] = i
             inner += 1
@@ -418,7 +418,7 @@ def shade(world, crowd, inner, outer):
     COSINE what comes through, as WAY what it has flown. See `transport.fly`."""
     while inner > 0 or outer > 0:
         outer = through(world, crowd, inner, outer)
-        inner, outer = back(world, crowd, outer)
+        inner, outer = back(world, crowd, outer), 0
 
 
 @njit(**KERNEL)
@@ -430,12 +430,13 @@ def through(world, crowd, count, outer):
         i = crowd.inner[k]
         last = FAINT * unit(mix(words[at(BITS, i)] + GOLDEN)) + 1e-300
         end = mean * (logarithm(numbers[at(COSINE, i)]) - logarithm(last))
-        lay(ways, k, three(numbers, R, i), three(numbers, TX, i), max(end, 0.0))
+        sure = words[at(MORE, i)] == np.uint64(0)
+        lay(ways, k, three(numbers, R, i), three(numbers, TX, i), max(end, 0.0) if sure else math.inf)
     meet(g.grid, ways, count)
     for k in range(count):
         i, facet = crowd.inner[k], ways.facets[k, 0]
         if facet == NONE:
-            numbers[at(COSINE, i)] = 0.0
+            numbers[at(COSINE, i)] *= float(words[at(MORE, i)])
             continue
         p, toward = three(numbers, R, i), three(numbers, TX, i)
         t, cosine, _, slack = found(g.grid, facet, p, toward)
@@ -458,10 +459,10 @@ def through(world, crowd, count, outer):
 
 @njit(**KERNEL)
 def back(world, crowd, count):
-    """Take light in `outer` away, or to where it comes into the medium again: what does is then in `inner`, what only
-    meets a corner in `outer`. Return how many."""
-    grid, lanes, ways, inner, outer = world.geometry.grid, crowd.lanes, crowd.ways, 0, 0
-    numbers = lanes.numbers
+    """Take light in `outer` away, or to where it comes into the medium again: what does is then in `inner`, as MORE
+    that it may only have met a corner. Return how many."""
+    grid, lanes, ways, inner = world.geometry.grid, crowd.lanes, crowd.ways, 0
+    numbers, words = lanes.numbers, lanes.words
     for k in range(count):
         i = crowd.outer[k]
         lay(ways, k, three(numbers, R, i), three(numbers, TX, i), math.inf)
@@ -472,18 +473,12 @@ def back(world, crowd, count):
             continue
         p, toward = three(numbers, R, i), three(numbers, TX, i)
         t, cosine, _, slack = found(grid, facet, p, toward)
-        comes = cosine > 0.0
-        if not comes:
-            p = step(p, t + beyond(slack, cosine), toward)
-            put(numbers, R, i, p)
-            comes = home_of(grid, ways.facets[k], p) == 0
-        if comes:
-            crowd.inner[inner] = i
-            inner += 1
-        else:
-            crowd.outer[outer] = i
-            outer += 1
-    return inner, outer
+        if not cosine > 0.0:
+            put(numbers, R, i, step(p, t + beyond(slack, cosine), toward))
+        words[at(MORE, i)] = np.uint64(1)
+        crowd.inner[inner] = i
+        inner += 1
+    return inner
 
 
 # ------------------------------------------------------------------------------------------- coming and going

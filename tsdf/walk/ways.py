@@ -13,7 +13,7 @@ import numpy as np
 from tsdf.compiled import fetch, njit
 from tsdf.vectors import KERNEL, dot, step, triple
 from tsdf.walk.cells import FEW, SIDES
-from tsdf.walk.grid import BEYOND, NONE, box_around, compared, inverse
+from tsdf.walk.grid import BEYOND, NONE, box_around, inverse, line_of, passes
 from tsdf.walk.lanes import STRIDE, at, put, three
 
 PAIRS = 1024  # of ways and facets that are looked at together
@@ -39,14 +39,17 @@ class Ways(NamedTuple):
     facets: np.ndarray
     near: np.ndarray
     last: np.ndarray
+    marks: np.ndarray
     pairs: np.ndarray
+    reach: np.ndarray
 
 
 def ways_of(size: int) -> Ways:
     """Return room for so many ways, at most STRIDE."""
     return Ways(
         np.zeros(NUMBERS * STRIDE), np.zeros(WHOLES * STRIDE, np.int64), np.full((size, 1), NONE, np.int32),
-        np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros((PAIRS, 2), np.int64),
+        np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(PART, np.int32), np.zeros((PAIRS, 2), np.int64),
+        np.zeros(PAIRS),
     )  # fmt: skip
 
 
@@ -184,20 +187,24 @@ def search(grid, ways, near):
         if there - here > FEW:
             n, p, d = triple(slab.way), three(numbers, PX, i), three(numbers, DX, i)
             each, level = inverse(dot(n, d)), dot(n, p)
-            a, b = (slab.low - level) * each, (slab.high - level) * each
+            s, t = (slab.low - level) * each, (slab.high - level) * each
             low, high = numbers[at(FROM, i)], min(numbers[at(GONE, i)], numbers[at(END, i)])
-            a, b = max(low, min(a, b)), min(high, max(a, b))
-            box = box_around(grid, wholes[at(THERE, i)], n, step(p, a, d), step(p, b, d))
+            s, t = max(low, min(s, t)), min(high, max(s, t))
+            box = box_around(grid, wholes[at(THERE, i)], n, step(p, s, d), step(p, t, d))
+        a, b, c, e = np.int32(box[0]), np.int32(box[1]), np.int32(box[2]), np.int32(box[3])
         while here < there:
             end = min(there, here + PART)
             if count + PART > PAIRS:
                 compare(grid, ways, count)
                 count = 0
-            for place in range(here, end):
-                facet, its = grid.listed[np.uint64(place), 0], grid.listed[np.uint64(place), 1]
-                pairs[np.uint64(count), 0], pairs[np.uint64(count), 1] = i, facet
-                u = (box[0] <= (its >> 8 & 255)) & (box[1] >= (its & 255))
-                count += u & (box[2] <= (its >> 24 & 255)) & (box[3] >= (its >> 16 & 255))
+            for k2 in range(end - here):
+                its = grid.listed[np.uint64(here + k2), 1]
+                u = (a <= (its >> np.int32(8) & np.int32(255))) & (b >= (its & np.int32(255)))
+                v = (c <= (its >> np.int32(24) & np.int32(255))) & (e >= (its >> np.int32(16) & np.int32(255)))
+                ways.marks[np.uint64(k2)] = np.int32(u & v)
+            for k2 in range(end - here):
+                pairs[np.uint64(count), 0], pairs[np.uint64(count), 1] = i, grid.listed[np.uint64(here + k2), 0]
+                count += ways.marks[np.uint64(k2)]
             here = end
     compare(grid, ways, count)
 
@@ -210,17 +217,17 @@ def compare(grid, ways, count):
         fetch(facets[pairs[np.uint64(k), 1]])
         fetch(facets[pairs[np.uint64(k), 1], 8:])
     for k in range(count):
-        i, f = pairs[np.uint64(k), 0], pairs[np.uint64(k), 1]
-        n = (facets[np.uint64(f), 0], facets[np.uint64(f), 1], facets[np.uint64(f), 2])
-        cosine = dot(n, three(numbers, DX, i))
-        height = facets[np.uint64(f), 3] - dot(n, three(numbers, PX, i))
+        i, f = pairs[np.uint64(k), 0], np.uint64(pairs[np.uint64(k), 1])
+        n = facets[f, 0], facets[f, 1], facets[f, 2]
+        cosine, height = dot(n, three(numbers, DX, i)), facets[f, 3] - dot(n, three(numbers, PX, i))
         pairs[np.uint64(left), 0], pairs[np.uint64(left), 1] = i, f
-        left += (height * cosine >= 0.0) & (abs(height) <= numbers[at(END, i)] * abs(cosine))
+        ways.reach[np.uint64(left)] = height / cosine
+        left += (height * cosine >= 0.0) & (abs(height) <= numbers[at(END, i)] * abs(cosine)) & (cosine != 0.0)
     for k in range(left):
-        i, f = pairs[np.uint64(k), 0], pairs[np.uint64(k), 1]
-        p, d = three(numbers, PX, i), three(numbers, DX, i)
-        end, met = numbers[at(END, i)], ways.facets[ways.wholes[at(NAME, i)]]
-        numbers[at(END, i)] = min(end, compared(grid, met, NONE, f, p, d, end) + grid.margin)
+        i, f, t = pairs[np.uint64(k), 0], pairs[np.uint64(k), 1], ways.reach[np.uint64(k)]
+        if t < numbers[at(END, i)] and passes(facets, f, line_of(three(numbers, PX, i), three(numbers, DX, i))):
+            numbers[at(END, i)] = t
+            ways.facets[ways.wholes[at(NAME, i)], 0] = f
 
 
 @njit(**KERNEL)
