@@ -12,7 +12,7 @@ import numpy as np
 
 from tsdf.compiled import fetch, njit
 from tsdf.vectors import KERNEL, dot, step, triple
-from tsdf.walk.cells import FEW, SIDES
+from tsdf.walk.cells import FEW, PAD, SIDES
 from tsdf.walk.grid import BEYOND, NONE, box_around, inverse, line_of, passes
 from tsdf.walk.lanes import STRIDE, at, put, three
 
@@ -212,7 +212,7 @@ def search(grid, ways, near):
 @njit(**KERNEL)
 def compare(grid, ways, count):
     """Note the facets of pairs that are the first that their ways meet; see `grid.compared`."""
-    numbers, pairs, facets, left = ways.numbers, ways.pairs, grid.facets, 0
+    numbers, pairs, facets, left, hair = ways.numbers, ways.pairs, grid.facets, 0, 0.25 * PAD * grid.edge
     for k in range(count):
         fetch(facets[pairs[np.uint64(k), 1]])
         fetch(facets[pairs[np.uint64(k), 1], 8:])
@@ -221,8 +221,9 @@ def compare(grid, ways, count):
         n = facets[f, 0], facets[f, 1], facets[f, 2]
         cosine, height = dot(n, three(numbers, DX, i)), facets[f, 3] - dot(n, three(numbers, PX, i))
         pairs[np.uint64(left), 0], pairs[np.uint64(left), 1] = i, f
-        ways.reach[np.uint64(left)] = height / cosine
-        left += (height * cosine >= 0.0) & (abs(height) <= numbers[at(END, i)] * abs(cosine)) & (cosine != 0.0)
+        t = height / cosine
+        ways.reach[np.uint64(left)] = t
+        left += (t >= max(numbers[at(FROM, i)] - hair, 0.0)) & (t <= min(numbers[at(GONE, i)] + hair, numbers[at(END, i)]))
     for k in range(left):
         i, f, t = pairs[np.uint64(k), 0], pairs[np.uint64(k), 1], ways.reach[np.uint64(k)]
         if t < numbers[at(END, i)] and passes(facets, f, line_of(three(numbers, PX, i), three(numbers, DX, i))):
