@@ -13,7 +13,7 @@ import numpy as np
 from tsdf.compiled import fetch, njit
 from tsdf.vectors import KERNEL, dot, step, triple
 from tsdf.walk.cells import FEW, PAD, SIDES
-from tsdf.walk.grid import BEYOND, NONE, box_around, inverse, line_of, passes
+from tsdf.walk.grid import BEYOND, NONE, box_in, inverse, line_of, passes
 from tsdf.walk.lanes import STRIDE, at, put, three
 
 PAIRS = 1024  # of ways and facets that are looked at together
@@ -174,12 +174,23 @@ def sift(grid, ways, near):
     return left
 
 
+@njit(forceinline=True, **KERNEL)
+def cell_at(grid, p):
+    """Return the numbers along the axes of the cell that p is in, at least 0."""
+    by, low = 1.0 / grid.edge, grid.low
+    i, j, k = np.int64((p[0] - low[0]) * by), np.int64((p[1] - low[1]) * by), np.int64((p[2] - low[2]) * by)
+    return float(i), float(j), float(k)
+
+
 @njit(**KERNEL)
 def search(grid, ways, near):
     """Note which facets ways meet in their cells."""
     numbers, wholes, pairs, count = ways.numbers, ways.wholes, ways.pairs, 0
     for k in range(near):
-        fetch(grid.listed[grid.slabs[wholes[at(FAR, ways.near[np.uint64(k)])]].first])
+        first = grid.slabs[wholes[at(FAR, ways.near[np.uint64(k)])]].first
+        fetch(grid.listed[first])
+        fetch(grid.listed[first + 8])
+        fetch(grid.listed[first + 16])
     for k in range(near):
         i = ways.near[np.uint64(k)]
         slab = grid.slabs[np.uint64(wholes[at(FAR, i)])]
@@ -190,7 +201,7 @@ def search(grid, ways, near):
             s, t = (slab.low - level) * each, (slab.high - level) * each
             low, high = numbers[at(FROM, i)], min(numbers[at(GONE, i)], numbers[at(END, i)])
             s, t = max(low, min(s, t)), min(high, max(s, t))
-            box = box_around(grid, wholes[at(THERE, i)], n, step(p, s, d), step(p, t, d))
+            box = box_in(grid, cell_at(grid, step(p, 0.5 * (low + numbers[at(GONE, i)]), d)), n, step(p, s, d), step(p, t, d))
         a, b, c, e = np.int32(box[0]), np.int32(box[1]), np.int32(box[2]), np.int32(box[3])
         while here < there:
             end = min(there, here + PART)
