@@ -1,13 +1,14 @@
 """Kernels of pictures compiled ahead: by a process of its own, while this one makes ready what is to be rendered.
 
-They take most of a first picture, on one processor, and are the same for all scenes and levels but those of `lanes`.
+They take most of a first picture, on one processor, and are the same for all scenes and levels but those of `lanes` and
+`bodies`.
 """
 
 import threading
 
 from tsdf.compiled import compile_ahead, end_with_parent
 from tsdf.scene.levels import AUTO, LEVELS
-from tsdf.scene.specs import Box, Scene, Slab
+from tsdf.scene.specs import Box, Mesh, Scene, Slab
 from tsdf.walk import transport
 
 
@@ -18,8 +19,8 @@ def begin(scene: Scene | None = None, level: str = AUTO) -> None:
 
 
 def _lone(scene: Scene, level: str) -> bool:
-    """Return whether a scene is walked in lanes, see `lanes.suited`."""
-    alone = len(scene.media) == 1 and isinstance(scene.media[0].shape, Box | Slab) and not scene.surfaces
+    """Return whether a scene is walked in lanes, see `lanes.suited` and `bodies.suited`."""
+    alone = len(scene.media) == 1 and isinstance(scene.media[0].shape, Box | Mesh | Slab) and not scene.surfaces
     return alone and not LEVELS[level].traits.placed and not scene.render.explicit_grains
 
 

@@ -18,7 +18,7 @@ from tsdf.sampling import GOLDEN, mix, unit
 from tsdf.vectors import KERNEL, dot, renewed, step
 from tsdf.walk import lanes as L
 from tsdf.walk.geometry import MESH, Geometry
-from tsdf.walk.grid import NONE, free_around, held, home_of, plane_hit, slipped
+from tsdf.walk.grid import NONE, free_around, held, plane_hit, slipped
 from tsdf.walk.lanes import (
     AIMED,
     BACK,
@@ -28,7 +28,6 @@ from tsdf.walk.lanes import (
     DX,
     FREE,
     KEY,
-    LENGTH,
     LIGHT,
     LIVE,
     LOST,
@@ -48,8 +47,8 @@ from tsdf.walk.lanes import (
     WAY,
     WIDTH,
     Lanes,
-    Z,
     R,
+    Z,
     at,
     deep,
     lanes_of,
@@ -58,11 +57,14 @@ from tsdf.walk.lanes import (
     wait,
 )
 from tsdf.walk.sides import HAIR, logarithm
-from tsdf.walk.transport import GRAZING, UNKNOWN, beyond, carried
+from tsdf.walk.transport import GRAZING, beyond, carried
 from tsdf.walk.walker import EVENTS, FAINT, PATIENCE, Media, power
 from tsdf.walk.ways import Ways, lay, meet, ways_of
 
-OUTSIDE, STRAY, ENTERED = 4, 5, 3  # more of `lanes.STATE`: it is outside and may come back, or alone will know where it is
+OUTSIDE = 4  # more of `lanes.STATE`: it is not known to be inside
+# ONCE of a lane: the next event is all that is known of; it has jumped to where that is so, or as far as the boundary;
+# it has come in, if it did not only meet a corner
+ALONE, CROSSED, REACHED, ENTERED = 1, 2, 4, 3
 FRESH = -2.0  # FREE of a lane that has not flown since it was found how far it is from all facets
 
 
@@ -103,10 +105,10 @@ def found(grid, facet, p, d):
 
 
 @njit(**KERNEL)
-def enter(world, crowd, count, fresh):
-    """Take the lanes in `outer`, so many, from outside to where they come inside, or let them find light; those that
-    come inside are then in `flying`. Return how many. `fresh` samples may begin inside."""
-    g, grid, lanes, ways = world.geometry, world.geometry.grid, crowd.lanes, crowd.ways
+def enter(world, crowd, count):
+    """Take the lanes in `outer`, so many, that are not known to be inside, to where they come inside, or let them find
+    light; those that are inside are then in `flying`. Return how many. See `transport.fly`."""
+    grid, lanes, ways = world.geometry.grid, crowd.lanes, crowd.ways
     numbers, words, inside = lanes.numbers, lanes.words, 0
     for k in range(count):
         i = crowd.outer[k]
@@ -120,9 +122,6 @@ def enter(world, crowd, count, fresh):
         p, d = three(numbers, PX, i), three(numbers, DX, i)
         t, cosine, _, slack = found(grid, facet, p, d)
         if cosine > 0.0:
-            if not fresh:
-                words[at(STATE, i)] = np.uint64(STRAY)
-                continue
             if slipped(grid, ways.facets[k], 0, p, GRAZING * slack):
                 words[at(STATE, i)] = np.uint64(LIGHT)
                 continue
@@ -152,7 +151,7 @@ def arrive(world, crowd, count):
         numbers[at(LUCK, i)], numbers[at(L.WEIGHT, i)], words[at(MET, i)] = 0.0, 1.0, np.uint64(0)
         for a in range(lanes.amounts.shape[1]):
             lanes.amounts[i, a] = 0.0
-    return enter(world, crowd, count, True)
+    return enter(world, crowd, count)
 
 
 # ------------------------------------------------------------------------------------------- steps
@@ -169,10 +168,11 @@ def start(world, crowd, count):
             free, key = numbers[at(FREE, i)], words[at(KEY, i)]
             drawn = free >= 0.0
             words[at(AIMED, i)] = np.uint64(free == FRESH)
+            words[at(ONCE, i)] = words[at(ONCE, i)] if words[at(ONCE, i)] != np.uint64(REACHED) else np.uint64(0)
             key = key if drawn else key + GOLDEN
             words[at(KEY, i)] = key
             numbers[at(FREE, i)] = free if drawn else -mean * logarithm(1.0 - unit(mix(key)))
-        count = enter(world, crowd, fly(world, crowd, count), False)
+        count = enter(world, crowd, fly(world, crowd, count))
 
 
 @njit(**KERNEL)
@@ -225,8 +225,11 @@ def fly(world, crowd, count):
             continue
         p, d = three(numbers, PX, i), three(numbers, DX, i)
         t, cosine, _, slack = found(grid, max(facet, 0), p, d)
-        if facet == NONE or not cosine > 0.0:
-            words[at(STATE, i)], numbers[at(WAY, i)] = np.uint64(STRAY if entered else LOST), 0.0
+        if facet == NONE or not cosine > 0.0:  # it has only met a corner, or rounding has brought it outside
+            words[at(STATE, i)], numbers[at(WAY, i)] = np.uint64(OUTSIDE), 0.0
+            words[at(KEY, i)] -= GOLDEN if entered else np.uint64(0)
+            crowd.outer[outer] = i
+            outer += 1
             continue
         words[at(ONCE, i)] = np.uint64(0 if entered else words[at(ONCE, i)])
         move = beyond(slack, cosine)
@@ -308,39 +311,39 @@ def land(world, crowd):
             numbers[at(BOUND, i)] = 0.0
             put(numbers, PX, i, step(p, size, e))
             continue
-        state, p, t, _ = leap_out(g, facet, p, e, size, three(numbers, DX, i))
+        state, p, t = leap_out(g, facet, p, e, size, three(numbers, DX, i))
         put(numbers, PX, i, p)
         numbers[at(BACK, i)] = 1.0 - t / size if t < size else 0.0
         words[at(STATE, i)] = np.uint64(state)
         numbers[at(BOUND, i)] = 0.0
         if state == WALKS:
-            words[at(ONCE, i)] = np.uint64(2)
+            words[at(ONCE, i)] = np.uint64(CROSSED if t < size else REACHED)
         crowd.outer[outer] = i
         outer += state == OUTSIDE
     for i in range(live):  # `transport.wander` would begin again
         once = words[at(ONCE, i)]
-        if once == np.uint64(1):
+        if once == np.uint64(ALONE) or once == np.uint64(REACHED):
             numbers[at(BOUND, i)], numbers[at(FREE, i)] = free_around(grid, three(numbers, PX, i), 0.0), FRESH
-        words[at(ONCE, i)] = np.uint64(once == np.uint64(2))
+        words[at(ONCE, i)] = once if once == np.uint64(REACHED) else np.uint64(once == np.uint64(CROSSED))
         if deep(world.leaps) and once != np.uint64(0):
-            numbers[at(WAITS, i)] = wait(world.leaps, words[at(ONCE, i)], numbers[at(BOUND, i)])
+            numbers[at(WAITS, i)] = wait(world.leaps, np.uint64(once == np.uint64(CROSSED)), numbers[at(BOUND, i)])
     return outer
 
 
 @njit(forceinline=True, **KERNEL)
 def leap_out(g, facet, p, e, size, q):
-    """Return what becomes of a jump from p along e that meets a facet, after which light goes on along q; where it ends,
-    and at what distance the boundary is. See `transport.land`."""
+    """Return what becomes of a jump from p along e that meets a facet, after which light goes on along q; where it ends
+    and how far the boundary is. See `transport.land`."""
     t, cosine, n, slack = found(g.grid, facet, p, e)
     inside = cosine > 0.0
     t = t if inside else 0.0
     if t >= size:
-        return LOST, step(p, size, e), size, slack
+        return WALKS, step(p, size, e), size
     outward = dot(q, n)
     move = beyond(slack, cosine) if inside else 0.0
     move = -min(move, 0.5 * t) if outward < 0.0 else move
     state = LIGHT if outward > 0.0 and g.convex else (OUTSIDE if outward > 0.0 else WALKS)
-    return state if inside else STRAY, step(p, t + move, e), t, slack
+    return state if inside else OUTSIDE, step(p, t + move, e), t
 
 
 # ------------------------------------------------------------------------------------------- light that is aimed
@@ -364,8 +367,8 @@ def connect(world, batch, crowd):
 
 @njit(**KERNEL)
 def jump(world, crowd):
-    """Take light that is aimed to where it leaves its grain, or to the boundary; what is inside is then in `inner`, what
-    is outside in `outer`, and how many are those. TX holds whither, R, Z and PHI where it is, BACK as `lanes.shade`."""
+    """Take light that is aimed to where it leaves its grain, or to the boundary, and list it as `inner` if it is inside
+    there, `outer` if that is not known; return how many. TX holds whither, R where it is; BACK as `lanes.shade`."""
     g, grid, lanes, ways = world.geometry, world.geometry.grid, crowd.lanes, crowd.ways
     numbers, words, scale, limited, inner, outer = lanes.numbers, lanes.words, world.media.scale[0], 0, 0, 0
     used = (np.uint64(2) + np.uint64(world.media.traits.jumps)) * GOLDEN
@@ -398,12 +401,10 @@ def jump(world, crowd):
             size = math.sqrt(dot(offset, offset))
             each = 1.0 / size
             e = (offset[0] * each, offset[1] * each, offset[2] * each)
-            state, end, t, _ = leap_out(g, facet, p, e, size, toward)
+            state, end, t = leap_out(g, facet, p, e, size, toward)
             put(numbers, R, i, end)
             numbers[at(BACK, i)] = 1.0 - t * each if t < size else 0.0
-            if state == STRAY:
-                state = WALKS if home_of(grid, ways.facets[k], end) == 0 else OUTSIDE
-        if state == WALKS or state == LOST:
+        if state == WALKS:
             crowd.inner[inner] = i
             inner += 1
         elif state == OUTSIDE:
@@ -485,17 +486,6 @@ def back(world, crowd, count):
 
 
 @njit(**KERNEL)
-def settle(world, batch, lanes, i):
-    """Let a lane that walks no more find its light, or hand its walker over."""
-    stray, number = lanes.words[at(STATE, i)] == np.uint64(STRAY), lanes.counts[L.HANDED]
-    if stray:
-        lanes.words[at(STATE, i)] = np.uint64(LOST)
-    L.settle(world, batch, lanes, i)
-    if stray:
-        batch.walkers[number].medium = UNKNOWN
-
-
-@njit(**KERNEL)
 def welcome(world, batch, crowd, job, count):
     """Make the next samples ready, so many, as far as they come to a grain."""
     lanes = crowd.lanes
@@ -503,7 +493,7 @@ def welcome(world, batch, crowd, job, count):
     lanes.counts[NEXT] += count
     start(world, crowd, arrive(world, crowd, count))
     for k in range(L.sort(lanes, count)):
-        settle(world, batch, lanes, lanes.others[k])
+        L.settle(world, batch, lanes, lanes.others[k])
 
 
 @njit(**KERNEL)
@@ -512,7 +502,7 @@ def relieve(world, batch, crowd, job, total):
     lanes = crowd.lanes
     counts, gone = lanes.counts, L.ended(lanes)
     for k in range(gone):
-        settle(world, batch, lanes, lanes.gone[k])
+        L.settle(world, batch, lanes, lanes.gone[k])
     gone = L.replace(lanes, gone)
     while (gone > 0 or counts[LIVE] < WIDTH) and counts[NEXT] < total and not L.crowded(batch, lanes):
         welcome(world, batch, crowd, job, min(WIDTH, total - counts[NEXT]))
@@ -528,10 +518,10 @@ def soar(world, batch, crowd):
     while count > 0:
         count = 0
         for i in range(lanes.counts[LIVE]):
-            if words[at(STATE, i)] == np.uint64(WALKS) and numbers[at(WAITS, i)] <= 0.0:
-                if L.soars(world, batch, lanes, i):
-                    crowd.flying[count] = i
-                    count += 1
+            waits = words[at(STATE, i)] != np.uint64(WALKS) or numbers[at(WAITS, i)] > 0.0
+            if not waits and L.soars(world, batch, lanes, i):
+                crowd.flying[count] = i
+                count += 1
         start(world, crowd, count)
     for i in range(lanes.counts[LIVE]):
         gone |= words[at(STATE, i)] != np.uint64(WALKS)
@@ -564,5 +554,5 @@ def walk(world, batch, crowd, job, total):
         outer = land(world, crowd)
         if lanes.amounts.shape[1] > 0:
             L.absorb(world, batch, lanes)
-        enter(world, crowd, outer, False)
+        enter(world, crowd, outer)
         batch.counters[EVENTS] += counts[LIVE]

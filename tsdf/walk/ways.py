@@ -13,7 +13,7 @@ import numpy as np
 from tsdf.compiled import fetch, njit
 from tsdf.vectors import KERNEL, dot, step, triple
 from tsdf.walk.cells import FEW, PAD, SIDES
-from tsdf.walk.grid import BEYOND, NONE, box_in, inverse, line_of, passes
+from tsdf.walk.grid import BEYOND, GRAZING, NONE, box_in, inverse, line_of, passes
 from tsdf.walk.lanes import STRIDE, at, put, three
 
 PAIRS = 1024  # of ways and facets that are looked at together
@@ -201,21 +201,23 @@ def search(grid, ways, near):
             s, t = (slab.low - level) * each, (slab.high - level) * each
             low, high = numbers[at(FROM, i)], min(numbers[at(GONE, i)], numbers[at(END, i)])
             s, t = max(low, min(s, t)), min(high, max(s, t))
-            box = box_in(grid, cell_at(grid, step(p, 0.5 * (low + numbers[at(GONE, i)]), d)), n, step(p, s, d), step(p, t, d))
+            box = box_in(
+                grid, cell_at(grid, step(p, 0.5 * (low + numbers[at(GONE, i)]), d)), n, step(p, s, d), step(p, t, d)
+            )
         a, b, c, e = np.int32(box[0]), np.int32(box[1]), np.int32(box[2]), np.int32(box[3])
         while here < there:
             end = min(there, here + PART)
             if count + PART > PAIRS:
                 compare(grid, ways, count)
                 count = 0
-            for k2 in range(end - here):
-                its = grid.listed[np.uint64(here + k2), 1]
+            for j in range(end - here):
+                its = grid.listed[np.uint64(here + j), 1]
                 u = (a <= (its >> np.int32(8) & np.int32(255))) & (b >= (its & np.int32(255)))
                 v = (c <= (its >> np.int32(24) & np.int32(255))) & (e >= (its >> np.int32(16) & np.int32(255)))
-                ways.marks[np.uint64(k2)] = np.int32(u & v)
-            for k2 in range(end - here):
-                pairs[np.uint64(count), 0], pairs[np.uint64(count), 1] = i, grid.listed[np.uint64(here + k2), 0]
-                count += ways.marks[np.uint64(k2)]
+                ways.marks[np.uint64(j)] = np.int32(u & v)
+            for j in range(end - here):
+                pairs[np.uint64(count), 0], pairs[np.uint64(count), 1] = i, grid.listed[np.uint64(here + j), 0]
+                count += ways.marks[np.uint64(j)]
             here = end
     compare(grid, ways, count)
 
@@ -223,7 +225,8 @@ def search(grid, ways, near):
 @njit(**KERNEL)
 def compare(grid, ways, count):
     """Note the facets of pairs that are the first that their ways meet; see `grid.compared`."""
-    numbers, pairs, facets, left, hair = ways.numbers, ways.pairs, grid.facets, 0, 0.25 * PAD * grid.edge
+    numbers, pairs, facets, left = ways.numbers, ways.pairs, grid.facets, 0
+    hair, thick = 0.25 * PAD * grid.edge, grid.margin / GRAZING
     for k in range(count):
         fetch(facets[pairs[np.uint64(k), 1]])
         fetch(facets[pairs[np.uint64(k), 1], 8:])
@@ -232,9 +235,11 @@ def compare(grid, ways, count):
         n = facets[f, 0], facets[f, 1], facets[f, 2]
         cosine, height = dot(n, three(numbers, DX, i)), facets[f, 3] - dot(n, three(numbers, PX, i))
         pairs[np.uint64(left), 0], pairs[np.uint64(left), 1] = i, f
-        t = height / cosine
-        ways.reach[np.uint64(left)] = t
-        left += (t >= max(numbers[at(FROM, i)] - hair, 0.0)) & (t <= min(numbers[at(GONE, i)] + hair, numbers[at(END, i)]))
+        ways.reach[np.uint64(left)] = height / cosine
+        a = height - (numbers[at(FROM, i)] - hair) * cosine  # at its begin and its end in the cell
+        b = height - (numbers[at(GONE, i)] + hair) * cosine
+        met = (min(a, b) <= thick) & (max(a, b) >= -thick)
+        left += met & (height * cosine >= 0.0) & (abs(height) <= numbers[at(END, i)] * abs(cosine))
     for k in range(left):
         i, f, t = pairs[np.uint64(k), 0], pairs[np.uint64(k), 1], ways.reach[np.uint64(k)]
         if t < numbers[at(END, i)] and passes(facets, f, line_of(three(numbers, PX, i), three(numbers, DX, i))):
