@@ -109,12 +109,6 @@ def put(numbers, field, i, v):
 
 
 @njit(forceinline=True, **KERNEL)
-def varied(lights):
-    """Return whether light is not the same from everywhere."""
-    return lights.environment.shape[0] > 0 or lights.sun_chord2.shape[0] > 0
-
-
-@njit(forceinline=True, **KERNEL)
 def give(world, batch, sample, amounts, weight, light):
     """Add light to a sample, less what the amounts of matter that it has crossed take; see `walker.find`."""
     left = (1.0, 1.0, 1.0)
@@ -482,7 +476,7 @@ def settle(world, batch, lanes, i):
     numbers, state, amounts = lanes.numbers, lanes.words[at(STATE, i)], lanes.amounts[i]
     if state == np.uint64(LIGHT):
         light = world.lights.constant[0], world.lights.constant[1], world.lights.constant[2]
-        if varied(world.lights):
+        if world.lights.environment.shape[0] > 0 or world.lights.sun_chord2.shape[0] > 0:
             light = light_from(world.lights, three(numbers, DX, i), numbers[at(PDF, i)])
         give(world, batch, lanes.words[at(SAMPLE, i)], amounts, numbers[at(WEIGHT, i)], light)
     elif state == np.uint64(LOST):
