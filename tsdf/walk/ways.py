@@ -20,7 +20,9 @@ PAIRS = 1024  # of ways and facets that are looked at together
 PART = 64  # of a list, that is looked through at once
 
 # Numbers of a way: from where, whither, how far at most; how far it has come, and had before; where it leaves its cell
-# along each axis, how far that is from wall to wall, and how many cells it comes for each unit
+# along each axis, how far that is from wall to wall, how many cells it comes for each unit, and by how much the number
+# of its cell changes there. Its cell, the one before, how far facets are from that (of those in one with facets, its
+# number among these), and the number of the way
 PX, PY, PZ, DX, DY, DZ, END, GONE, FROM, TX, TY, TZ, IX, IY, IZ, CX, CY, CZ, NX, NY, NZ, NUMBERS = range(22)
 CELL, THERE, FAR, NAME, WHOLES = range(5)
 
@@ -29,9 +31,9 @@ class Ways(NamedTuple):
     """Ways from places, and what they meet.
 
     numbers (NUMBERS * STRIDE,), wholes (WHOLES * STRIDE,) int64: of the ways that are under way, from 0 on; facets (n,
-    1) int32: the first facet that each meets, or NONE; near (n,): those in a cell with facets, last (n,):
-    room for others; pairs (PAIRS, 2): a way
-    and a facet.
+    1) int32: the first facet that each meets, or NONE; near (n,): those in a cell with facets, or whose place another
+    takes, last (n,): which; marks (PART,) int32: which of a list to look at; pairs (PAIRS, 2), reach (PAIRS,): a way, a
+    facet, and how far from its begin the way meets the facet's plane.
     """
 
     numbers: np.ndarray
