@@ -173,16 +173,17 @@ def test_any_number_of_threads_and_portions(meshes, table, sky) -> None:
 
 
 def test_who_walks_in_lanes(meshes, table) -> None:
-    """A lone mesh, at levels that know no packing; nothing else."""
+    """A lone mesh, at levels that know no packing, whose grains are not tiny; nothing else."""
 
-    def walks(*shapes, level: str = "teleport", surfaces=()) -> bool:
-        media = tuple(MediumSpec(shape, 0.5, 0.4, (GrainSpec(table),)) for shape in shapes)
+    def walks(*shapes, level: str = "teleport", surfaces=(), radius: float = 0.4) -> bool:
+        media = tuple(MediumSpec(shape, 0.5, radius, (GrainSpec(table),)) for shape in shapes)
         made = world.build(Scene(OUTSIDE, (ONE,), media, surfaces), "teleport")
         return bodies.suited(made.place.arrays, made.media._replace(traits=LEVELS[level].traits))
 
     assert walks(meshes["convex"]) and walks(meshes["parts"]) and walks(meshes["dented"], level="isotropic")
     levels = ("explicit", "teleport-packed", "teleport-memory")
     assert not any(walks(meshes["convex"], level=level) for level in levels)
+    assert not walks(meshes["convex"], radius=0.004)
     far = replace(meshes["convex"], translate=(20.0, 0.0, 0.0))
     assert not walks(Sphere((0.0, 0.0, 0.0), 3.0)) and not walks(meshes["convex"], far)
     assert not walks(meshes["convex"], surfaces=(SurfaceSpec(Sphere((9.0, 0.0, 0.0), 1.0), (1.0, 1.0, 1.0)),))

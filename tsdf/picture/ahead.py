@@ -8,7 +8,7 @@ import threading
 
 from tsdf.compiled import compile_ahead, end_with_parent
 from tsdf.scene.levels import AUTO, LEVELS
-from tsdf.scene.specs import Box, Mesh, Scene, Slab
+from tsdf.scene.specs import Box, Scene, Slab
 from tsdf.walk import transport
 
 
@@ -19,8 +19,8 @@ def begin(scene: Scene | None = None, level: str = AUTO) -> None:
 
 
 def _lone(scene: Scene, level: str) -> bool:
-    """Return whether a scene is walked in lanes, see `lanes.suited` and `bodies.suited`."""
-    alone = len(scene.media) == 1 and isinstance(scene.media[0].shape, Box | Mesh | Slab) and not scene.surfaces
+    """Return whether a scene is walked in lanes, see `lanes.suited`; whether a mesh is shows later."""
+    alone = len(scene.media) == 1 and isinstance(scene.media[0].shape, Box | Slab) and not scene.surfaces
     return alone and not LEVELS[level].traits.placed and not scene.render.explicit_grains
 
 

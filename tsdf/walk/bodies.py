@@ -81,10 +81,12 @@ class Crowd(NamedTuple):
 
 
 def suited(g: Geometry, media: Media) -> bool:
-    """Return whether nothing is in a scene but one medium in a mesh, at a level that knows no packing."""
+    """Return whether nothing is in a scene but one medium in a mesh, at a level that knows no packing, in which light
+    flies from cell to cell: where it stays in one for long, few lanes look at a time, and wait as each alone would."""
     alone = len(g.kind) == 1 and g.kind[0] == MESH and len(g.balls) == 0 and g.engines == 1
     known = g.grid.closed and g.grid.shape[0] > 0 and len(g.grid.outer) == 0
-    return alone and known and not media.traits.placed and not media.singles
+    far = len(media.free) > 0 and media.free[0] >= g.grid.edge
+    return alone and known and far and not media.traits.placed and not media.singles
 
 
 def crowd_of(amounts: int) -> Crowd:
