@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tsdf.compiled import compiled_for
+from tsdf.compiled import compiled_for, not_ahead
 from tsdf.errors import SceneError, UsageError
 from tsdf.handle import Handle
 from tsdf.picture.trust import SHOWN, Moments, Trust, kurtosis_of
@@ -140,6 +140,7 @@ class Walkers:
             self.lanes = lanes.lanes_of(world.amounts)
             self.abreast, self.stride = Handle(self.lanes), lanes.walk
         elif bodies.suited(world.place.arrays, world.media):
+            not_ahead(transport.advance)
             crowd = bodies.crowd_of(world.amounts)
             self.lanes, self.abreast, self.stride = crowd.lanes, Handle(crowd), bodies.walk
         self.radiance = np.zeros((BLOCK, 3))  # more than most need: to lay it out takes as long as 2000 samples

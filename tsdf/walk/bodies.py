@@ -65,6 +65,7 @@ OUTSIDE = 4  # more of `lanes.STATE`: it is not known to be inside
 # ONCE of a lane: the next event is all that is known of; it has jumped to where that is so, or as far as the boundary;
 # it has come in, if it did not only meet a corner
 ALONE, CROSSED, REACHED, ENTERED = 1, 2, 4, 3
+SHORT = 0.25  # [cells] mean free paths below which lanes do not pay
 FRESH = -2.0  # FREE of a lane that has not flown since it was found how far it is from all facets
 
 
@@ -85,7 +86,7 @@ def suited(g: Geometry, media: Media) -> bool:
     flies from cell to cell: where it stays in one for long, few lanes look at a time, and wait as each alone would."""
     alone = len(g.kind) == 1 and g.kind[0] == MESH and len(g.balls) == 0 and g.engines == 1
     known = g.grid.closed and g.grid.shape[0] > 0 and len(g.grid.outer) == 0
-    far = len(media.free) > 0 and media.free[0] >= g.grid.edge
+    far = len(media.free) > 0 and media.free[0] >= SHORT * g.grid.edge
     return alone and known and far and not media.traits.placed and not media.singles
 
 
