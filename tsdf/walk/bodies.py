@@ -128,7 +128,7 @@ def enter(world, crowd, count):
             if slipped(grid, ways.facets[k], 0, p, GRAZING * slack):
                 words[at(STATE, i)] = np.uint64(LIGHT)
                 continue
-            numbers[at(BOUND, i)], words[at(ONCE, i)] = 0.0, np.uint64(1)
+            numbers[at(BOUND, i)], words[at(ONCE, i)] = 0.0, np.uint64(ALONE)
         else:
             p = step(p, t + beyond(slack, cosine), d)
             put(numbers, PX, i, p)
