@@ -273,6 +273,12 @@ def compile_ahead(kernel: Any, module: str) -> None:
         kept.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet)
 
 
+def not_ahead(kernel: Any) -> None:
+    """End the process that `compile_ahead` has begun for a kernel, for it is not needed."""
+    if (process := kernel._cache.process) is not None:
+        process.stdin.close()
+
+
 def end_with_parent() -> None:
     """End this process when the one that began it by `compile_ahead` has ended, however that came."""
 

@@ -1,15 +1,18 @@
 """Kernels compiled ahead are those that pictures call, and the process that does it ends with the one that asked."""
 
+import io
 import os
+from types import SimpleNamespace
 
 import pytest
+import trimesh
 
 from tsdf.compiled import compiling
 from tsdf.data import library
 from tsdf.picture import ahead, world
-from tsdf.picture.render import render
+from tsdf.picture.render import Walkers, render
 from tsdf.scene.levels import AUTO
-from tsdf.scene.scene import Box, Camera, ConstantLight, GrainSpec, MediumSpec, Scene, Sphere
+from tsdf.scene.scene import Box, Camera, ConstantLight, GrainSpec, MediumSpec, Mesh, Scene, Sphere
 from tsdf.walk import lanes, transport
 
 BEADS = GrainSpec(library.FOLDER / f"glass-beads{library.SUFFIX}")
@@ -50,6 +53,17 @@ def test_who_calls_a_kernel_waits_for_it(begun):
 def test_a_process_ends_when_the_one_that_began_it_is_gone(begun):
     begun.process.stdin.close()
     assert begun.process.wait(60) == 1
+
+
+@pytest.mark.parametrize("radius, ends", [(0.4, True), (0.001, False)])
+def test_it_is_told_to_end_where_a_mesh_is_walked_in_lanes(radius, ends, monkeypatch, tmp_path):
+    process = SimpleNamespace(stdin=io.BytesIO(), poll=lambda: 0)
+    monkeypatch.setattr(transport.advance._cache, "process", process)
+    trimesh.creation.icosphere(2, radius=3.0).export(tmp_path / "ball.ply")
+    medium = MediumSpec(Mesh(tmp_path / "ball.ply"), 0.3, radius, (BEADS,))
+    scene = Scene(Camera((20.0, 4.0, 0.0), (0.0, 0.0, 0.0), 4, 4), (ConstantLight((1.0, 1.0, 1.0)),), (medium,))
+    assert (Walkers(world.build(scene, "teleport")).lanes is not None) == ends
+    assert process.stdin.closed == ends
 
 
 def test_nothing_is_begun_where_kernels_are_kept(monkeypatch):

@@ -29,7 +29,7 @@ from tsdf.scene.scene import (
     Sphere,
     SurfaceSpec,
 )
-from tsdf.walk import geometry
+from tsdf.walk import bodies, geometry
 from tsdf.walk.cells import cells_of, free_of
 from tsdf.walk.geometry import clearance, exact_hit, unmet
 from tsdf.walk.room import BALL, BOX, SLAB, exact_depth, triangle_distance
@@ -266,9 +266,10 @@ def test_which_meshes_are_convex(bumpy):
 
 
 @pytest.mark.slow
-def test_who_leaves_a_lone_convex_mesh_asks_no_more(tmp_path, table):
-    """The ray engine is asked for what the camera sees and hardly more, the furnace is 1; where there is a surface, or
-    a dent, it is asked as it must be."""
+def test_who_leaves_a_lone_convex_mesh_asks_no_more(tmp_path, table, monkeypatch):
+    """One by one, walkers ask the ray engine for what the camera sees and hardly more, the furnace is 1; where there is
+    a surface, or a dent, it is asked as it must be."""
+    monkeypatch.setattr(bodies, "suited", lambda *_: False)
     convex, dented = load_grain("icosphere", subdivisions=3), load_grain("icosphere", subdivisions=3).vertices.copy()
     dented[0] *= 0.6
     asked = {}
@@ -306,8 +307,9 @@ class Slips:
         return np.where((found >= 0) & (cosine < 0.0), self.engine.run(beyond, ways), found)
 
 
-def test_what_slips_through_a_mesh_is_not_in_it(table, tmp_path):
+def test_what_slips_through_a_mesh_is_not_in_it(table, tmp_path, monkeypatch):
     """A camera's ray that the ray engine lets through a ball's front is outside when it meets the back, far from it."""
+    monkeypatch.setattr(bodies, "suited", lambda *_: False)
     trimesh.creation.icosphere(3, radius=10.0).export(tmp_path / "ball.ply")
     medium = MediumSpec(Mesh(tmp_path / "ball.ply"), 0.5, 1.0, (GrainSpec(table),), name="ball")
     camera = Camera((0.0, -60.0, 5.0), (0.0, 0.0, 0.0), 16, 16, fov_deg=15.0)

@@ -1,6 +1,7 @@
 """Kernels of pictures compiled ahead: by a process of its own, while this one makes ready what is to be rendered.
 
-They take most of a first picture, on one processor, and are the same for all scenes and levels but those of `lanes`.
+They take most of a first picture, on one processor, and are the same for all scenes and levels but those of `lanes` and
+`bodies`.
 """
 
 import threading
@@ -18,7 +19,7 @@ def begin(scene: Scene | None = None, level: str = AUTO) -> None:
 
 
 def _lone(scene: Scene, level: str) -> bool:
-    """Return whether a scene is walked in lanes, see `lanes.suited`."""
+    """Return whether a scene is walked in lanes, see `lanes.suited`; whether a mesh is shows later."""
     alone = len(scene.media) == 1 and isinstance(scene.media[0].shape, Box | Slab | Sphere) and not scene.surfaces
     return alone and not LEVELS[level].traits.placed and not scene.render.explicit_grains
 

@@ -18,13 +18,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tsdf.compiled import compiled_for
+from tsdf.compiled import compiled_for, not_ahead
 from tsdf.errors import SceneError, UsageError
 from tsdf.handle import Handle
 from tsdf.picture.trust import SHOWN, Moments, Trust, kurtosis_of
 from tsdf.picture.world import World, camera_of, sees
 from tsdf.scene.levels import LEVELS
-from tsdf.walk import lanes, packed, standing, transport
+from tsdf.walk import bodies, lanes, packed, standing, transport
 from tsdf.walk import walker as W
 from tsdf.walk.hybrid import ALL
 from tsdf.walk.transport import CameraArrays
@@ -140,7 +140,11 @@ class Walkers:
         self.lanes = self.abreast = None
         if lanes.suited(world.place.arrays, world.media):
             self.lanes = lanes.lanes_of(world.place.arrays, world.amounts)
-            self.abreast = Handle(self.lanes)
+            self.abreast, self.stride = Handle(self.lanes), lanes.walk
+        elif bodies.suited(world.place.arrays, world.media):
+            not_ahead(transport.advance)
+            crowd = bodies.crowd_of(world.place.arrays, world.amounts)
+            self.lanes, self.abreast, self.stride = crowd.lanes, Handle(crowd), bodies.walk
         self.radiance = np.zeros((BLOCK, 3))  # more than most need: to lay it out takes as long as 2000 samples
         self._lay_out()
 
@@ -191,7 +195,7 @@ class Walkers:
         counts = self.lanes.counts
         counts[:] = 0
         while (counts[lanes.LIVE] or counts[lanes.NEXT] < total) and not stop.is_set():
-            lanes.walk(self.arrays, self.batches[0], self.abreast, job, total)
+            self.stride(self.arrays, self.batches[0], self.abreast, job, total)
             self.finish(int(counts[lanes.HANDED]), stop)
 
     def visit(self, job: transport.Job, total: int, stop: threading.Event) -> None:

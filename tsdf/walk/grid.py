@@ -226,9 +226,15 @@ def box_around(grid, cell, n, p, q):
     """Return the lowest and the highest part of a cell, of SIDES a side, on the way from p to q in it: along the two
     axes that follow that nearest to n."""
     ny, nz = grid.shape[1], grid.shape[2]
-    size = 1.0 / grid.edge
     i, rest = cell // (ny * nz), cell % (ny * nz)
-    j, k = rest // nz, rest % nz
+    return box_in(grid, (float(i), float(rest // nz), float(rest % nz)), n, p, q)
+
+
+@njit(forceinline=True, **KERNEL)
+def box_in(grid, cell, n, p, q):
+    """Return what `box_around` does, for a cell by its numbers along the axes."""
+    i, j, k = cell
+    size = 1.0 / grid.edge
     x = ((p[0] - grid.low[0]) * size - i, (p[1] - grid.low[1]) * size - j, (p[2] - grid.low[2]) * size - k)
     y = ((q[0] - grid.low[0]) * size - i, (q[1] - grid.low[1]) * size - j, (q[2] - grid.low[2]) * size - k)
     a, b, c = abs(n[0]), abs(n[1]), abs(n[2])

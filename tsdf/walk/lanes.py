@@ -5,9 +5,8 @@ and a processor waits: each of their steps needs the one before it and ends in a
 walkers lie in lanes, each number of all of them side by side, and take a step together, so that the compiler works out
 several at once: a flight, a grain, the jump to where light leaves it. Those that are out find their light, and the next
 samples take their lanes. A sample's random numbers, and what is done with them, are those of `transport`, in the same
-order: a reader may hold `fly` against the first half of `wander` and `land` against its second. Loops without branches
-are those that the compiler works out several turns at once of. What is rare is handed over as it stands, to go on
-alone.
+order: a reader may hold `fly` against the first half of `wander` and `land` against its second. Of loops without
+branches the compiler works out several turns at once. What is rare is handed over as it stands, to go on alone.
 """
 
 import math
@@ -19,6 +18,7 @@ from tsdf.compiled import njit
 from tsdf.data.sampler import leave
 from tsdf.sampling import GOLDEN, key_of, mix, unit
 from tsdf.vectors import KERNEL, dot, renewed, step, triple
+from tsdf.walk import walker as W
 from tsdf.walk.geometry import NONE, Geometry
 from tsdf.walk.grid import GRAZING
 from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, ROOM, leap, missing, patience
@@ -26,21 +26,7 @@ from tsdf.walk.lights import radiance as light_from
 from tsdf.walk.room import BALL, BOX, SLAB
 from tsdf.walk.sides import HAIR, body_of, depth, landing, logarithm, sides, way_in, way_out
 from tsdf.walk.transport import aimed, carried, deflected, pixel_of, words_of
-from tsdf.walk.walker import (
-    DIM,
-    EVENTS,
-    FAINT,
-    FLY,
-    OTHER,
-    PATIENCE,
-    Media,
-    absorbed,
-    copy,
-    halves,
-    lives,
-    power,
-    write,
-)
+from tsdf.walk.walker import Media, absorbed, copy, halves, lives, power, write
 
 WIDTH = 128  # lanes that walk; as many more hold samples that are about to
 STRIDE = 2 * WIDTH + 8  # of one number of all lanes: no power of two, or all would want one line of the cache
@@ -112,12 +98,6 @@ def three(numbers, field, i):
 def put(numbers, field, i, v):
     """Write a triple of lane i."""
     numbers[at(field, i)], numbers[at(field + 1, i)], numbers[at(field + 2, i)] = v
-
-
-@njit(forceinline=True, **KERNEL)
-def varied(lights):
-    """Return whether light is not the same from everywhere."""
-    return lights.environment.shape[0] > 0 or lights.sun_chord2.shape[0] > 0
 
 
 @njit(forceinline=True, **KERNEL)
@@ -216,7 +196,7 @@ def fly(world, lanes, first, last):
     g, media, numbers, words = world.geometry, world.media, lanes.numbers, lanes.words
     mean, hair = media.free[0], HAIR * g.slack[0]
     body = sides(lanes.body)
-    most = np.uint64((media.limit if deep(world.leaps) else min(PATIENCE, media.limit)) - 1)
+    most = np.uint64((media.limit if deep(world.leaps) else min(W.PATIENCE, media.limit)) - 1)
     for i in range(first, last):
         p, d = three(numbers, PX, i), three(numbers, DX, i)
         free, bound, key = numbers[at(FREE, i)], numbers[at(BOUND, i)], words[at(KEY, i)]
@@ -331,11 +311,8 @@ def absorb(world, batch, lanes):
             lanes.amounts[i, slot] -= back * length
             numbers[at(LUCK, i)] = luck - least * (back * length)
     for i in range(lanes.counts[LIVE]):
-        if (
-            numbers[at(LUCK, i)] < DIM
-            and words[at(ONCE, i)] == np.uint64(0)
-            and words[at(STATE, i)] == np.uint64(WALKS)
-        ):
+        walks = words[at(ONCE, i)] == np.uint64(0) and words[at(STATE, i)] == np.uint64(WALKS)
+        if numbers[at(LUCK, i)] < W.DIM and walks:
             words[at(KEY, i)] += GOLDEN
             w = note(batch, lanes, i)
             if not lives(w, w.key):
@@ -344,24 +321,31 @@ def absorb(world, batch, lanes):
 
 
 @njit(**KERNEL)
+def soars(world, batch, lanes, i):
+    """Let a lane leap; return whether it has, and is to fly from there."""
+    numbers, words, w = lanes.numbers, lanes.words, note(batch, lanes, i)
+    later, bound = leap(world, batch, w, lanes.amounts[i])
+    numbers[at(WAITS, i)] = float(later)
+    if later == ENDS:
+        words[at(STATE, i)] = np.uint64(DEAD)
+    if later > LEAPT_ON or later == ENDS:
+        return False
+    put(numbers, PX, i, triple(w.p))
+    put(numbers, DX, i, triple(w.d))
+    words[at(KEY, i)], words[at(MET, i)] = w.key, np.uint64(w.events)
+    numbers[at(FREE, i)], numbers[at(LUCK, i)], numbers[at(PDF, i)] = w.free, w.luck, w.pdf
+    numbers[at(WEIGHT, i)], numbers[at(BOUND, i)] = w.weight, bound
+    return True
+
+
+@njit(**KERNEL)
 def soar(world, batch, lanes):
     """Let lanes leap that have come deep enough, see `leaps`; return whether any of them walks no more."""
     numbers, words, gone = lanes.numbers, lanes.words, False
     for i in range(lanes.counts[LIVE]):
         while words[at(STATE, i)] == np.uint64(WALKS) and numbers[at(WAITS, i)] <= 0.0:
-            w = note(batch, lanes, i)
-            later, bound = leap(world, batch, w, lanes.amounts[i])
-            numbers[at(WAITS, i)] = float(later)
-            if later > LEAPT_ON:
+            if not soars(world, batch, lanes, i):
                 break
-            if later == ENDS:
-                words[at(STATE, i)] = np.uint64(DEAD)
-                break
-            put(numbers, PX, i, triple(w.p))
-            put(numbers, DX, i, triple(w.d))
-            words[at(KEY, i)], words[at(MET, i)] = w.key, np.uint64(w.events)
-            numbers[at(FREE, i)], numbers[at(LUCK, i)], numbers[at(PDF, i)] = w.free, w.luck, w.pdf
-            numbers[at(WEIGHT, i)], numbers[at(BOUND, i)] = w.weight, bound
             fly(world, lanes, i, i + 1)
         gone |= words[at(STATE, i)] != np.uint64(WALKS)
     return gone
@@ -374,18 +358,33 @@ def soar(world, batch, lanes):
 def connect(world, batch, lanes):
     """Let light arrive from a light and be deflected into each lane's path by its grain; see `transport.connect`."""
     g, media, numbers, words = world.geometry, world.media, lanes.numbers, lanes.words
-    mean, reach = media.free[0], media.reach[0]
-    body = sides(lanes.body)
+    mean, body = media.free[0], sides(lanes.body)
     for i in range(lanes.counts[LIVE]):
         bound = numbers[at(BOUND, i)]
         around = max(bound, depth(body, three(numbers, PX, i)))
         numbers[at(BOUND, i)] = around if bound < 8.0 * mean else bound
-        key = words[at(KEY, i)] + GOLDEN
-        words[at(KEY, i)] = key
-        numbers[at(COSINE, i)] = unit(mix(key))
-        key = mix(key ^ OTHER)
-        words[at(ONE, i)], words[at(TWO, i)] = key, mix(key + GOLDEN)
-        words[at(BITS, i)], words[at(MORE, i)] = mix(key + GOLDEN + GOLDEN), mix(key + GOLDEN + GOLDEN + GOLDEN)
+        lot(numbers, words, i)
+    beam(world, lanes)
+    shade(g, media, lanes)
+    light(world, batch, lanes)
+
+
+@njit(forceinline=True, **KERNEL)
+def lot(numbers, words, i):
+    """Draw what light that is aimed at a lane needs: as COSINE whether any is, and four words."""
+    key = words[at(KEY, i)] + GOLDEN
+    words[at(KEY, i)] = key
+    numbers[at(COSINE, i)] = unit(mix(key))
+    key = mix(key ^ W.OTHER)
+    words[at(ONE, i)], words[at(TWO, i)] = key, mix(key + GOLDEN)
+    words[at(BITS, i)], words[at(MORE, i)] = mix(key + GOLDEN + GOLDEN), mix(key + GOLDEN + GOLDEN + GOLDEN)
+
+
+@njit(**KERNEL)
+def beam(world, lanes):
+    """Draw the light that is aimed at each lane: as AIMED whether there is any."""
+    media, numbers, words = world.media, lanes.numbers, lanes.words
+    mean, reach = media.free[0], media.reach[0]
     for i in range(lanes.counts[LIVE]):
         c, bound, weight = np.int64(words[at(KIND, i)]), numbers[at(BOUND, i)], 0.0
         share = math.exp((reach - bound) / mean) if reach < bound else 1.0
@@ -400,16 +399,21 @@ def connect(world, batch, lanes):
             weight *= numbers[at(WEIGHT, i)] / share
             put(numbers, RED, i, (light[0] * weight, light[1] * weight, light[2] * weight))
         words[at(AIMED, i)] = np.uint64(weight > 0.0)
-    shade(g, media, lanes)
+
+
+@njit(**KERNEL)
+def light(world, batch, lanes):
+    """Give samples the light that is aimed and comes through, see `shade`."""
+    media, numbers, words = world.media, lanes.numbers, lanes.words
     for i in range(lanes.counts[LIVE]):
         if words[at(AIMED, i)] == np.uint64(0):
             continue
         passed, way = numbers[at(COSINE, i)], numbers[at(WAY, i)]
-        if passed < FAINT:
+        if passed < W.FAINT:
             key = words[at(ONE, i)] + (np.uint64(3) + np.uint64(media.traits.jumps)) * GOLDEN
-            if unit(mix(key)) * FAINT >= passed:
+            if unit(mix(key)) * W.FAINT >= passed:
                 continue
-            passed = FAINT
+            passed = W.FAINT
         amounts, slot = lanes.amounts[i], media.slot[np.int64(words[at(KIND, i)])]
         if amounts.shape[0] > 0:
             copy(lanes.amounts[2 * WIDTH], amounts)
@@ -452,7 +456,7 @@ def note(batch, lanes, i):
         w.colour[k] = 1.0
     w.weight, w.luck, w.pdf = numbers[at(WEIGHT, i)], numbers[at(LUCK, i)], numbers[at(PDF, i)]
     w.free, w.skip, w.key, w.events = numbers[at(FREE, i)], 0.0, words[at(KEY, i)], np.int64(words[at(MET, i)])
-    w.sample, w.ray, w.medium, w.mode = np.int64(words[at(SAMPLE, i)]), NONE, 0, FLY
+    w.sample, w.ray, w.medium, w.mode = np.int64(words[at(SAMPLE, i)]), NONE, 0, W.FLY
     w.tries, w.shadow, w.single, w.left = 0, 0, 0, 0
     return w
 
@@ -463,7 +467,7 @@ def settle(world, batch, lanes, i):
     numbers, state, amounts = lanes.numbers, lanes.words[at(STATE, i)], lanes.amounts[i]
     if state == np.uint64(LIGHT):
         light = world.lights.constant[0], world.lights.constant[1], world.lights.constant[2]
-        if varied(world.lights):
+        if world.lights.environment.shape[0] > 0 or world.lights.sun_chord2.shape[0] > 0:
             light = light_from(world.lights, three(numbers, DX, i), numbers[at(PDF, i)])
         sample = lanes.words[at(SAMPLE, i)]
         give(world, batch, sample, amounts, numbers[at(WEIGHT, i)], light)
@@ -496,6 +500,13 @@ def welcome(world, batch, lanes, job, count):
     lanes.counts[NEXT] += count
     arrive(world.geometry, world.leaps, lanes, count)
     fly(world, lanes, WIDTH, WIDTH + count)
+    for k in range(sort(lanes, count)):
+        settle(world, batch, lanes, lanes.others[k])
+
+
+@njit(**KERNEL)
+def sort(lanes, count):
+    """List which samples that are about to walk do, and which do not; return how many do not."""
     ready, other = 0, 0
     for i in range(WIDTH, WIDTH + count):
         walks = lanes.words[at(STATE, i)] == np.uint64(WALKS)
@@ -503,8 +514,7 @@ def welcome(world, batch, lanes, job, count):
         lanes.others[other] = i
         ready, other = ready + walks, other + (not walks)
     lanes.counts[READY] = ready
-    for k in range(other):
-        settle(world, batch, lanes, lanes.others[k])
+    return other
 
 
 @njit(forceinline=True, **KERNEL)
@@ -514,20 +524,20 @@ def crowded(batch, lanes):
 
 
 @njit(**KERNEL)
-def relieve(world, batch, lanes, job, total):
-    """Settle the lanes that walk no more and let others have their place."""
-    counts, gone = lanes.counts, 0
-    for i in range(counts[LIVE]):
+def ended(lanes):
+    """List the lanes that walk no more; return how many."""
+    gone = 0
+    for i in range(lanes.counts[LIVE]):
         lanes.gone[gone] = i
         gone += lanes.words[at(STATE, i)] != np.uint64(WALKS)
-    for k in range(gone):
-        settle(world, batch, lanes, lanes.gone[k])
-    while gone > 0 or counts[LIVE] < WIDTH:
-        if counts[READY] == 0:
-            if counts[NEXT] == total or crowded(batch, lanes):
-                break
-            welcome(world, batch, lanes, job, min(WIDTH, total - counts[NEXT]))
-            continue
+    return gone
+
+
+@njit(**KERNEL)
+def replace(lanes, gone):
+    """Let those that are ready take the places of those that are gone, and others; return how many are still gone."""
+    counts = lanes.counts
+    while counts[READY] > 0 and (gone > 0 or counts[LIVE] < WIDTH):
         counts[READY] -= 1
         if gone > 0:
             gone -= 1
@@ -536,11 +546,31 @@ def relieve(world, batch, lanes, job, total):
             to = counts[LIVE]
             counts[LIVE] += 1
         move(lanes, lanes.ready[counts[READY]], to)
+    return gone
+
+
+@njit(**KERNEL)
+def close(lanes, gone):
+    """Let others have the places of those that are gone, for nobody is ready any more."""
+    counts = lanes.counts
     while gone > 0:
         gone -= 1
         counts[LIVE] -= 1
         if lanes.gone[gone] < counts[LIVE]:
             move(lanes, counts[LIVE], lanes.gone[gone])
+
+
+@njit(**KERNEL)
+def relieve(world, batch, lanes, job, total):
+    """Settle the lanes that walk no more and let others have their place."""
+    counts, gone = lanes.counts, ended(lanes)
+    for k in range(gone):
+        settle(world, batch, lanes, lanes.gone[k])
+    gone = replace(lanes, gone)
+    while (gone > 0 or counts[LIVE] < WIDTH) and counts[NEXT] < total and not crowded(batch, lanes):
+        welcome(world, batch, lanes, job, min(WIDTH, total - counts[NEXT]))
+        gone = replace(lanes, gone)
+    close(lanes, gone)
 
 
 @njit(**KERNEL)
@@ -565,4 +595,4 @@ def walk(world, batch, lanes, job, total):
         land(world, lanes)
         if lanes.amounts.shape[1] > 0:
             absorb(world, batch, lanes)
-        batch.counters[EVENTS] += counts[LIVE]
+        batch.counters[W.EVENTS] += counts[LIVE]
