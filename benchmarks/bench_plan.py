@@ -62,7 +62,10 @@ def judged(made: Plan, found: dict[Candidate, Measured], target: float) -> dict[
         for c, m in found.items() if c in by
     }  # fmt: skip
     floors = {str(c): by[c].floor.value / m.floor for c, m in found.items() if c in by and m.resolved}
-    turns = {str(c): by[c].variance * by[c].turn / (m.variance * m.turn) for c, m in found.items() if c in by}
+    turns = {
+        str(c): by[c].noise(after) ** 2 * after / (m.variance * m.turn)
+        for c, m in found.items() if c in by and m.variance > NOTHING
+    }  # fmt: skip
     takes = {c: m.seconds(target) for c, m in found.items()}
     low, high = ({c: m.seconds(target, shift) for c, m in found.items()} for shift in (-1.0, 1.0))
     if min(takes.values()) == math.inf:  # none meets it: how little error there is after as long as anybody waits

@@ -73,8 +73,8 @@ class Measured:
 
 @dataclass
 class Shots:
-    """Batches of one candidate: mean radiance of pixels in each (h, w, 3), and over all of them the sum of the variances
-    of these means; samples of a pixel in each, and a sample's time [s]."""
+    """Batches of one candidate: mean radiance of pixels in each (h, w, 3), and over all of them the sum of variances of
+    these means; samples of a pixel in each, and a sample's time [s]."""
 
     spp: int
     turn: float

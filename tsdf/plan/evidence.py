@@ -12,7 +12,7 @@ from tsdf.picture.footprint import PER_E
 from tsdf.plan import beliefs, prior
 from tsdf.plan.beliefs import Belief
 from tsdf.plan.pilot import Apart, Pilot, Seen
-from tsdf.plan.prediction import Prediction
+from tsdf.plan.prediction import NOTHING, Prediction, Rare
 from tsdf.scene.levels import LEVELS
 from tsdf.study.candidates import Candidate, candidates
 from tsdf.walk.lights import LUMINANCE
@@ -190,11 +190,29 @@ class Evidence:
             bias_error, floor = self.bolder(candidate, bias_error, floor)
         floor = self.beside_the_reference(candidate, floor)
         texture, most = (math.sqrt(max(value**2 - bias**2, 0.0)) for value in (floor.value, floor.high))
-        seen, piloted = self.cost(candidate)
+        seen, piloted, rare = self.cost(candidate)
         turn = seen.seconds * self.pixels / self.threads
+        regions = 0.0 if candidate.single else self.of_regions(candidate, bias, bias_error)
         return Prediction(
-            candidate, bias, bias_error, texture, most - texture, floor, seen.variance, turn, piloted, known,
+            candidate, bias, bias_error, texture, most - texture, floor, seen.variance, turn, piloted, known, regions,
+            rare,
         )  # fmt: skip
+
+    def of_regions(self, candidate: Candidate, bias: float, bias_error: float) -> float:
+        """Return the error of means of regions: what the level that is expected to be least off has of it, that is its
+        bias, and how pilots of both differ. Neither has single grains, so this is known long before texture is."""
+        alike = [c for c, p in self.pilots.items() if not c.single and c.leap is None and p.seen.mean > 0.0]
+        nearest = min(alike, key=lambda c: self.expected[c.level].bias, default=None)  # of as much, the first
+        own = self.pilots.get(candidate)
+        if own is None or nearest is None or nearest == candidate or not own.each:
+            return math.hypot(bias, bias_error)
+        square, error = own.regions(self.pilots[nearest])
+        one = self.expected[candidate.level]
+        differs = beliefs.of_square(one.bias, max(one.spread, 1e-9), square, error)
+        seen = self.apart(nearest)
+        wide = self.expected[nearest.level].bias
+        own_bias, own_error = beliefs.of_bias(wide, seen and seen.bias, seen.bias_error if seen else math.inf)
+        return math.hypot(own_bias, own_error, differs.value)
 
     def seen_after(self, k: int) -> Apart | None:
         """Return what pilots of chains with so many explicit grains first saw, by the one that knows it best: all miss
@@ -380,22 +398,26 @@ class Evidence:
         the last alike."""
         return -math.log1p(-1.0 / max(self.length, 1.05))
 
-    def cost(self, candidate: Candidate) -> tuple[Seen, bool]:
-        """Return variance and time of a sample, by its pilot or from those of others, and whether it was the former.
+    def cost(self, candidate: Candidate) -> tuple[Seen, bool, Rare]:
+        """Return variance and time of a sample, by its pilot or from those of others, whether it was the former, and
+        what of the variance only chance finds.
 
         Suns that only chance finds make as much more of the variance as they are smaller than in pilots: all of it, at
         most, of single grains, and of levels whose grains let a share of light go exactly straight on, along which
         nothing is aimed, that share of it.
         """
         seen, piloted = self.cost_of_pilots(candidate)
-        found = seen.variance
+        found, rare = seen.variance, NOTHING
         if not candidate.single:
             explicit = self.pilots.get(Candidate("explicit"))
             all_of_it = self.of_reference(explicit).variance if explicit is not None and explicit.each else math.inf
             straight = 0.0 if LEVELS[candidate.level].traits.points or not self.atoms else self.atoms * all_of_it
             found = min(found, straight)
         more = (self.rarer - 1.0) * found if self.rarer > 1.0 else 0.0
-        return seen._replace(variance=seen.variance + more), piloted
+        if more and not candidate.single:
+            each = self.atoms * self.coverage / self.chance  # meetings of a sample, under the suns of pilots
+            rare = Rare(more, each / self.rarer * self.pixels, math.sqrt(found * each))
+        return seen._replace(variance=seen.variance + more), piloted, rare
 
     def cost_of_pilots(self, candidate: Candidate) -> tuple[Seen, bool]:
         """Return the same of the lights that pilots are under."""
