@@ -61,6 +61,10 @@ def judged(made: Plan, found: dict[Candidate, Measured], target: float) -> dict[
         str(c): min((by[c].error(after) / m.error(after, shift) for shift in SHIFTS), key=lambda r: abs(math.log(r)))
         for c, m in found.items() if c in by
     }  # fmt: skip
+    bars = {  # by how many standard errors of both what was measured is off from what was said
+        str(c): (by[c].floor.value - m.floor) / math.hypot(by[c].floor.error, m.floor_error)
+        for c, m in found.items() if c in by and by[c].floor.error > 0.0
+    }  # fmt: skip
     floors = {str(c): by[c].floor.value / m.floor for c, m in found.items() if c in by and m.resolved}
     turns = {
         str(c): by[c].noise(after) ** 2 * after / (m.variance * m.turn)
@@ -77,7 +81,7 @@ def judged(made: Plan, found: dict[Candidate, Measured], target: float) -> dict[
         "target": target, "chosen": str(chosen.candidate), "best": str(best), "takes": mine, "best_takes": takes[best],
         "told": all(m.known(target) for m in (found[best], own) if m is not None),
         "over": mine / takes[best], "over_at_least": low.get(chosen.candidate, math.nan) / min(high.values()),
-        "errors": ratios, "near": near, "floors": floors, "costs": turns, "planning": made.spent, "why": list(made.why),
+        "errors": ratios, "near": near, "floors": floors, "bars": bars, "costs": turns, "planning": made.spent, "why": list(made.why),
     }  # fmt: skip
 
 
@@ -143,10 +147,9 @@ def main() -> None:
                     f"{100 * p.bias_error:.2f} cost {p.variance * p.turn / (m.variance * m.turn):.2f}"
                     for p in mine.values() if p is not None
                 )  # fmt: skip
-                error = math.sqrt(max(m.square, 0.0) + m.square_error) - m.floor
                 tail = f" {100 * m.largest:.0f} % in 1 %" if m.resolved else ""
                 print(
-                    f"    {c!s:24s} {100 * m.floor:6.2f}+{100 * error:.2f} % bias {100 * m.bias:+.2f}{tail} | {told}",
+                    f"    {c!s:24s} {100 * m.floor:6.2f}+{100 * m.floor_error:.2f} % bias {100 * m.bias:+.2f}{tail} | {told}",
                     flush=True,
                 )
             if args.out:
@@ -169,6 +172,9 @@ def summary(rows: list[dict[str, Any]]) -> None:
             good = sum(0.5 <= r <= 2.0 for r in ratios)
             share = 100.0 * good / max(len(ratios), 1)
             print(f"{title}: {said} within a factor 2: {good} of {len(ratios)} ({share:.0f} %)")
+        bars = [abs(z) for row in some for z in row["bars"].values()]
+        shares = [100.0 * sum(z <= n for z in bars) / max(len(bars), 1) for n in (1.0, 2.0)]
+        print(f"{title}: floors within one, two standard errors: {shares[0]:.0f} %, {shares[1]:.0f} % of {len(bars)}")
         right = sum(row["over"] <= 1.2 for row in some)  # inf / inf is neither
         print(
             f"{title}: chosen within 20 % of the cheapest: {right} of {len(some)} ({100.0 * right / len(some):.0f} %)"

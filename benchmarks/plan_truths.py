@@ -55,6 +55,10 @@ class Measured:
         return math.sqrt(max(self.square, 0.0))
 
     @property
+    def floor_error(self) -> float:
+        return max(math.sqrt(max(self.square, 0.0) + self.square_error) - self.floor, 1e-6)
+
+    @property
     def resolved(self) -> bool:
         return self.square > SEEN * self.square_error and self.floor > LEAST
 

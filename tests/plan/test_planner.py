@@ -222,20 +222,28 @@ def test_light_that_goes_straight_on_finds_suns_by_chance() -> None:
 
 @pytest.mark.slow
 def test_where_there_is_nothing_to_see(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Black scenes are planned, and nothing is said to be known of their noise; so are scenes without
-    grains, or with none in sight. Those without light are refused."""
+    """Black scenes are planned, and nothing is said to be known of their noise; so are scenes without grains. Those
+    without light are refused, and so are cameras that see nothing, as tsdf-render does, in the same words."""
     monkeypatch.setattr(planner, "SECONDS", 0.3)
     monkeypatch.setattr(planner, "LEAST_PILOTS", 0.2)
     with pytest.raises(SceneError, match="a scene without light"):
         plan(replace(pile(ball, 160.0), lights=()), 0.05)
     away = replace(pile(ball, 160.0).camera, target=(0.0, -999.0, 999.0))
-    made = plan(replace(pile(ball, 160.0), camera=away), 0.05, threads=2)
-    assert len(made.why) == 3 and math.isfinite(made.chosen.variance)
-    black = plan(replace(pile(ball, 160.0), camera=away, lights=(SUN,)), 0.05, threads=2)
+    for scene in (replace(pile(ball, 160.0), camera=away), Scene(away, LIGHTS, ())):
+        with pytest.raises(SceneError, match="sees neither a medium nor a surface") as planned:
+            plan(scene, 0.05, threads=2)
+        with pytest.raises(SceneError) as rendered:
+            render.render(world.build(scene, "volume"), 1)
+        assert str(planned.value) == str(rendered.value)
+    shade = SurfaceSpec(Rectangle((0.0, 0.0, 20.0), (99.0, 0.0, 0.0), (0.0, 99.0, 0.0)), (0.0, 0.0, 0.0))
+    low = SunLight((0.0, 0.0, 1.0), (3.0, 3.0, 3.0), 0.53)  # behind a black roof
+    near = replace(pile(ball, 9.0), lights=(low,), surfaces=(shade,))
+    black = plan(near, 0.05, threads=2)
     assert any("no pilot has seen any light" in note for note in black.notes)
     assert "nothing is known of its noise" in black.why[0] and json.dumps(report.facts(black), allow_nan=False)
+    floor = SurfaceSpec(Rectangle((0.0, 0.0, 0.0), (9.0, 0.0, 0.0), (0.0, 9.0, 0.0)), (0.5, 0.5, 0.5))
     for lights in (LIGHTS, (SUN,)):
-        assert plan(Scene(away, lights, ()), 0.05, threads=1).why[0].startswith("take ")
+        assert plan(Scene(pile(ball, 9.0).camera, lights, (), (floor,)), 0.05, threads=1).why[0].startswith("take ")
 
 
 @pytest.mark.slow

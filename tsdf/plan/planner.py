@@ -14,7 +14,7 @@ from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
 from tsdf.errors import SceneError, UsageError
 from tsdf.picture.trust import kurtosis_of
-from tsdf.picture.world import World, build
+from tsdf.picture.world import World, build, check_sight
 from tsdf.plan import needs, prior
 from tsdf.plan.choice import Wish, choose
 from tsdf.plan.evidence import BOLD, BOLD_BIAS, GRAINS, MEETINGS, Evidence
@@ -242,6 +242,7 @@ class _Planning(Evidence):
         if all(medium.inside == "grains" for medium in self.scene.media):
             self.places = dict.fromkeys((False, True), place(self.scene, grains=True))  # one for all levels
         world = build(self.scene, "volume", leap=0.0, places=self.places)
+        check_sight(world)
         if world.empty:
             self.refuse(world)
         self.bodies = prior.bodies(world, self.tables)
