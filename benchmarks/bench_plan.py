@@ -81,7 +81,8 @@ def judged(made: Plan, found: dict[Candidate, Measured], target: float) -> dict[
         "target": target, "chosen": str(chosen.candidate), "best": str(best), "takes": mine, "best_takes": takes[best],
         "told": all(m.known(target) for m in (found[best], own) if m is not None),
         "over": mine / takes[best], "over_at_least": low.get(chosen.candidate, math.nan) / min(high.values()),
-        "errors": ratios, "near": near, "floors": floors, "bars": bars, "costs": turns, "planning": made.spent, "why": list(made.why),
+        "errors": ratios, "near": near, "floors": floors, "bars": bars, "costs": turns, "planning": made.spent,
+        "why": list(made.why),
     }  # fmt: skip
 
 
@@ -148,10 +149,8 @@ def main() -> None:
                     for p in mine.values() if p is not None
                 )  # fmt: skip
                 tail = f" {100 * m.largest:.0f} % in 1 %" if m.resolved else ""
-                print(
-                    f"    {c!s:24s} {100 * m.floor:6.2f}+{100 * m.floor_error:.2f} % bias {100 * m.bias:+.2f}{tail} | {told}",
-                    flush=True,
-                )
+                shown = f"{100 * m.floor:6.2f}+{100 * m.floor_error:.2f} % bias {100 * m.bias:+.2f}{tail}"
+                print(f"    {c!s:24s} {shown} | {told}", flush=True)
             if args.out:
                 args.out.write_text(json.dumps(rows, indent=1))
     summary(rows)

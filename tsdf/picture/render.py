@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tsdf.compiled import compiled_for
-from tsdf.errors import SceneError, UsageError
+from tsdf.errors import UsageError
 from tsdf.handle import Handle
 from tsdf.picture.trust import SHOWN, Moments, Trust, kurtosis_of
 from tsdf.picture.world import World, camera_of, check_sight

@@ -148,11 +148,8 @@ class Evidence:
         if candidate.explicit_grains or best.looked.sum() <= own.looked.sum():
             return seen
         whole, part = best.apart(other), best.apart(other, own)
-        unsure = part.square_error + LEAST**2
-        alike = min((max(seen.square, 0.0) + unsure) / (max(part.square, 0.0) + unsure), 1.0)
-        square = seen.square + alike * (whole.square - part.square)
-        error = max(seen.square_error, alike * whole.square_error)
-        fourth = max(seen.fourth, alike**2 * whole.fourth)
+        square = seen.square + whole.square - part.square
+        error, fourth = max(seen.square_error, whole.square_error), max(seen.fourth, whole.fourth)
         return seen._replace(square=square, square_error=error, few=whole.few, fourth=fourth)
 
     @property
