@@ -25,6 +25,7 @@ LEAST_PER_E = 2.0  # explicit grains of facets that bring texture down by e, at 
 TOLD, LEAST_ALIKE = 3.0, 0.5  # standard errors from which on a candidate misses other texture than all do, and what
 # of that it misses at least
 ALIKE = 0.2  # of the logarithm of an error, what two levels of teleportation may differ by
+DIFFERS = 0.07  # of the texture that all levels miss alike, by which they may differ and no pilot tell
 LEAST = 1e-4  # [1] of an error
 UNSURE = 0.8  # of the logarithm of texture, what that law may be off by for other grains than spheres
 FADING = 0.3  # of the logarithm of texture, what that law may be off by; and of what is left of a bias
@@ -267,7 +268,7 @@ class Evidence:
             noise = math.hypot(own.square_error, other.square_error)
         if abs(more) > TOLD * noise:
             square = max(square + more, (LEAST_ALIKE * missed.value) ** 2)
-        return Belief(math.sqrt(square), missed.error)
+        return Belief(math.sqrt(square), math.hypot(missed.error, DIFFERS * missed.value))
 
     def texture_of(self, best: Candidate) -> Belief:
         """Return the texture that a candidate without single grains misses, by its pilot."""
@@ -323,8 +324,8 @@ class Evidence:
     ) -> tuple[float, float, Belief]:
         """Return what is left of a bias, its error and a floor with k explicit grains, of one with fewer.
 
-        Texture falls by e for every `per_e` of them, and so does what it adds to the mean; what a level makes of all
-        packings alike falls as the share of grains that are still met at that level, of as many as light meets. Where
+        Texture falls by e for every `per_e` of them, and as the light that meets more grains yet, and so does what it
+        adds to the mean; what a level makes of all packings alike falls as that light, of as many as it meets. Where
         the first go by pixel, all pixels come to what the one is left with that has most.
         """
         if k == before:
@@ -332,7 +333,7 @@ class Evidence:
         off = min(math.hypot(bias, bias_error), floor.value)
         # light that a few bright paths bring does not get weaker with the grains that it has met, but rarer
         lasting = self.lasting * (1.0 - 0.5 * self.glinting)
-        rate = max(1.0 / self.per_e, lasting)
+        rate = 1.0 / self.per_e + lasting  # as much less light is left, and it shows as much less
         left = math.exp((before - k) * (self.fading or rate if before else rate))
         if self.far and not before:
             left = min(1.0, self.ratio * left)
