@@ -25,6 +25,7 @@ LEAST_PER_E = 2.0  # explicit grains of facets that bring texture down by e, at 
 TOLD, LEAST_ALIKE = 3.0, 0.5  # standard errors from which on a candidate misses other texture than all do, and what
 # of that it misses at least
 ALIKE = 0.2  # of the logarithm of an error, what two levels of teleportation may differ by
+REGIONAL = 1.5  # times what levels are off by in slabs, that regions of a picture differ by
 DIFFERS = 0.07  # of the texture that all levels miss alike, by which they may differ and no pilot tell
 LEAST = 1e-4  # [1] of an error
 UNSURE = 0.8  # of the logarithm of texture, what that law may be off by for other grains than spheres
@@ -197,20 +198,20 @@ class Evidence:
         )  # fmt: skip
 
     def of_regions(self, candidate: Candidate, bias: float, bias_error: float) -> float:
-        """Return the error of means of regions: what the level that is expected to be least off has of it, that is its
-        bias, and how pilots of both differ. Neither has single grains, so this is known long before texture is."""
+        """Return the error of means of regions, as high as it may well be: what the level that is expected to be least
+        off has of it, that is its bias, and how pilots of both differ. Neither has single grains, so this is known long
+        before texture is."""
         alike = [c for c, p in self.pilots.items() if not c.single and c.leap is None and p.seen.mean > 0.0]
         nearest = min(alike, key=lambda c: self.expected[c.level].bias, default=None)  # of as much, the first
-        own = self.pilots.get(candidate)
-        if own is None or nearest is None or nearest == candidate or not own.each:
+        own, one = self.pilots.get(candidate), self.expected[candidate.level]
+        if nearest is None or nearest == candidate:
             return math.hypot(bias, bias_error)
-        square, error = own.regions(self.pilots[nearest])
-        one = self.expected[candidate.level]
-        differs = beliefs.of_square(one.bias, max(one.spread, 1e-9), square, error)
+        square, error = own.regions(self.pilots[nearest]) if own is not None and own.each else (None, math.inf)
+        differs = beliefs.of_square(REGIONAL * one.bias, max(one.spread, 1e-9), square, error)
         seen = self.apart(nearest)
         wide = self.expected[nearest.level].bias
         own_bias, own_error = beliefs.of_bias(wide, seen and seen.bias, seen.bias_error if seen else math.inf)
-        return math.hypot(own_bias, own_error, differs.value)
+        return math.hypot(own_bias, own_error, differs.high)
 
     def seen_after(self, k: int) -> Apart | None:
         """Return what pilots of chains with so many explicit grains first saw, by the one that knows it best: all miss
