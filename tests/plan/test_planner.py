@@ -19,7 +19,7 @@ from tsdf.plan import evidence, planner, report, shot
 from tsdf.plan.beliefs import CERTAIN, Belief
 from tsdf.plan.pilot import Apart, Clocks, Pilot
 from tsdf.plan.planner import plan
-from tsdf.plan.prediction import Plan, Prediction
+from tsdf.plan.prediction import TIE, Plan, Prediction
 from tsdf.reference_data.make_checks import CHECKS
 from tsdf.scene.levels import LEVELS
 from tsdf.scene.scene import (
@@ -150,7 +150,7 @@ def test_other_wishes_other_choices(far: Plan, ball: tsdf.Table) -> None:
     assert "no other that was looked at is likely to have a tenth less" in hurried.why[0]
     looked = [p for p in hurried.predictions if p.piloted]
     errors = [math.hypot(p.floor.value, p.floor.error, p.noise(0.5 / hurried.load)) for p in looked]
-    assert errors[0] <= planner.TIE * min(errors)
+    assert errors[0] <= TIE * min(errors)
 
 
 @pytest.mark.slow

@@ -7,6 +7,8 @@ from typing import NamedTuple
 from tsdf.plan.prediction import TIE, UNFINISHED, Prediction
 from tsdf.scene.levels import LEVELS
 
+SWAMPED = 1.2  # times the least error of pixels that one may have and be taken for its regions
+
 
 class Wish(NamedTuple):
     """What a picture is to be like, and what is known of all candidates."""
@@ -43,7 +45,8 @@ def choose(found: list[Prediction], wish: Wish) -> tuple[Prediction, bool]:
     error in it, of those that aim at small suns. With so many samples it is the cheapest of those whose noise is about
     the least, or small enough, and that miss less than the target. None is taken of whose noise nothing is known,
     unless nothing is of any. Where that with the least error has no single grains and misses more texture than the
-    target, no pixel can be right with it, nor with any other that has none: of these it is the one whose regions are.
+    target, no pixel can be right with it, nor with any other that has none: of these, as far as their errors are within
+    a fifth of it, it is the one whose regions are.
     """
     found = [p for p in found if math.isfinite(p.variance)] or found
     if wish.dear:  # what few samples have told of paths that long is not what they take
@@ -63,7 +66,9 @@ def choose(found: list[Prediction], wish: Wish) -> tuple[Prediction, bool]:
         aimed = aimed or [p for p in found if not wish.unfinished(p)] or found
         least = min(aimed, key=lambda p: p.likely_error(limit))
         if not least.candidate.single and least.texture > wish.target:
-            return safest([p for p in aimed if not p.candidate.single], lambda p: p.error_of_regions(limit)), True
+            enough = SWAMPED * least.likely_error(limit)
+            alike = [p for p in aimed if not p.candidate.single and not p.likely_error(limit) > enough]
+            return safest(alike, lambda p: p.error_of_regions(limit)), True
         enough = TIE * least.likely_error(limit)
         alike = [p for p in aimed if p.likely_error(limit) <= enough] or aimed  # of pilots without light
         return safest(alike, lambda p: math.hypot(p.bias, p.bias_error, p.noise(limit))), False

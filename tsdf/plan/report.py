@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from tsdf.plan.choice import SWAMPED
 from tsdf.plan.prediction import BLOCK, TIE, UNFINISHED, Plan, Prediction
 from tsdf.plan.prior import Body
 
@@ -112,8 +113,9 @@ def _left(plan: Plan, able: float) -> str:
         glints = "single grains, which meet suns by chance, would be mostly noise until "
         glints += f"{span(plan.glints)}, so their glints are left out"
     if plan.regional:
-        off = f"means of {BLOCK} by {BLOCK} pixels are off by {percent(p.error_of_regions(able))} beside it, no others'"
-        alike = f"what all without single grains miss alike does not tell them apart: {off} by a tenth less"
+        alike = "what all without single grains miss alike does not tell them apart: beside it means of "
+        alike += f"{BLOCK} by {BLOCK} pixels are off by {percent(p.error_of_regions(able))}, about the least of all "
+        alike += "with as much error"
         return f"{glints}; {alike}" if glints else alike
     return glints or "no other that was looked at is likely to have a tenth less"
 
@@ -197,6 +199,8 @@ def _short_of_time(plan: Plan, able: float) -> str:
     done = [p for p in known if not (plan.glints and p.candidate.single and p.noise(able) > UNFINISHED)] or known
     if plan.regional:
         some = [p for p in done if not p.candidate.single]
+        enough = SWAMPED * min((p.likely_error(able) for p in some), default=0.0)
+        some = [p for p in some if not p.likely_error(able) > enough]
         second = min(some or done, key=lambda p: p.error_of_regions(able))
         off = percent(second.error_of_regions(able))
         runner = f"runner-up: {second.candidate}, an error of {percent(second.error(able))}, of such means {off}"
