@@ -125,7 +125,10 @@ class Evidence:
         bound = BOUND * (more - 1.0) * max(seen.square, 0.0)  # not all of it is glints, so this is rather too much
         # which facets mirror the real sun, of those that mirror a wider one, is chance, in a picture of few most of all
         luck = math.sqrt((more - 1.0) * more**2 * seen.fourth / self.pixels)
-        return seen._replace(square=more * seen.square, square_error=math.hypot(more * error, bound, luck))
+        mean = more * seen.square  # over pictures, of which few have most: half of them have less than this over
+        rare = math.hypot(1.0, luck / mean) if mean > 0.0 else 1.0
+        error = math.hypot(more * error, bound, luck)
+        return seen._replace(square=mean / rare, square_error=error, scale=more / rare)
 
     def unseen(self) -> float:
         """Return the square of texture that glints of flat facets may make which no pilot has met: one, of a facet that
@@ -175,9 +178,12 @@ class Evidence:
             alike = self.seen_after(fewer) if fewer <= k else None  # what other chains miss then
             if later is None and alike is None:
                 continue
+            before = floor.value
             bias, bias_error, floor = self.faded(one, bias, bias_error, floor, base, fewer)
             if later is not None:
-                floor = beliefs.of_square(max(floor.value, LEAST), UNSURE, later.square, later.square_error)
+                unseen = max(1.0 - later.pixels / self.pixels, 0.0) * self.luck(before, floor.value)
+                error = math.hypot(later.square_error, unseen)
+                floor = beliefs.of_square(max(floor.value, LEAST), UNSURE, later.square, error)
                 bias, bias_error = beliefs.of_bias(max(bias_error, LEAST), later.bias, later.bias_error, bias)
             elif alike is not None:
                 square = alike.square - alike.bias**2 + bias**2 + bias_error**2  # which may be of either sign
@@ -264,7 +270,7 @@ class Evidence:
         assert other is not None
         square = missed.value**2 + bias**2
         more = own.square - other.square - bias**2 + other.bias**2
-        noise = self.sparkle * math.hypot(own.own, other.own)
+        noise = other.scale * math.hypot(own.own, other.own)
         if own.pixels < other.pixels:  # which differ by what they look at as well
             noise = math.hypot(own.square_error, other.square_error)
         if abs(more) > TOLD * noise:
@@ -335,7 +341,11 @@ class Evidence:
         # light that a few bright paths bring does not get weaker with the grains that it has met, but rarer
         lasting = self.lasting * (1.0 - 0.5 * self.glinting)
         rate = 1.0 / self.per_e + lasting  # as much less light is left, and it shows as much less
-        left = math.exp((before - k) * (self.fading or rate if before else rate))
+        seen = self.fading if before else None
+        fall, kept = (k - before) * (seen or rate), 0.0
+        if seen is None:  # glints go straight on through parallel facets, as long as they do: which law holds is open
+            kept = 0.5 * self.glinting * max(fall - self.straight(k) + self.straight(before), 0.0)
+        left = math.exp(kept - fall)
         if self.far and not before:
             left = min(1.0, self.ratio * left)
         packing, alike = self.of_one_packing(one), math.exp((before - k) * self.lasting)
@@ -344,15 +354,38 @@ class Evidence:
         bias, bias_error = bias * less, math.hypot(bias_error, FADING * bias) * less
         texture = math.sqrt(max(floor.value**2 - off**2, 0.0)) * left
         value = math.hypot(texture, min(math.hypot(bias, bias_error), floor.value))
-        unsure = math.hypot(floor.error * left, FADING * texture)
+        luck = math.sqrt(texture**2 + self.luck(texture / left, texture)) - texture
+        unsure = math.hypot(floor.error * left, FADING * texture, math.expm1(kept) * texture, luck)
         return bias, bias_error, Belief(value, math.hypot(unsure, 0.5 * min(bias_error, value)))
+
+    def straight(self, k: int) -> float:
+        """Return how much less glints show, as a logarithm, of light that is deflected once and goes straight on
+        through all other grains that it meets, if that is more than k grains: where each lets a share a straight on, n
+        grains are met by n a^(n - 1) (1 - a)^2 of it."""
+        a = min(max(self.atoms, 1e-9), 0.95)
+        return -0.5 * (k * math.log(a) + math.log1p(k * (1.0 - a)))
+
+    def luck(self, texture: float, left: float) -> float:
+        """Return by how much the square of what explicit grains leave of texture may be off, because few pixels make
+        it: which of these they leave is chance."""
+        share = min((left / max(texture, LEAST)) ** 2, 1.0)
+        return texture**2 * math.sqrt(share * (1.0 - share) / max(self.glints, 1.0))
+
+    @property
+    def glints(self) -> float:
+        """How many pixels of the picture make most of what levels miss, by the pilot that knows it best."""
+        best = self.best_known()
+        seen = self.apart(best) if best is not None else None
+        if seen is None or not seen.fourth > 0.0 or not seen.square > RESOLVED * seen.scale * seen.noise:
+            return float(self.pixels)
+        return self.pixels * min((seen.square / seen.scale) ** 2 / seen.fourth / self.sparkle, 1.0)
 
     @property
     def glinting(self) -> float:
         """Which share of the square of what levels miss a few pixels make, beyond what they do of any texture [1]."""
         best = self.best_known()
         seen = self.apart(best) if best is not None else None
-        if seen is None or not seen.square > RESOLVED * self.sparkle * seen.noise:
+        if seen is None or not seen.square > RESOLVED * seen.scale * seen.noise:
             return 0.0
         return max(seen.few - USUAL, 0.0) / (1.0 - USUAL)
 

@@ -61,7 +61,8 @@ class Apart(NamedTuple):
     """How a pilot differs from another: of the mean, and the mean of the squared difference of pixels, without noise;
     over the other's mean [1], with standard errors, and what noise alone makes of the last of these. Of the square, the
     share that one pixel in `FEW` makes of which it is most, and the mean of its own square, what noise makes of its
-    error in these pixels, and how many these are."""
+    error in these pixels, and how many these are; and how many times what was seen the square is, where the picture has
+    smaller suns."""
 
     bias: float
     bias_error: float
@@ -72,6 +73,7 @@ class Apart(NamedTuple):
     fourth: float = 0.0
     own: float = 0.0
     pixels: int = 0
+    scale: float = 1.0
 
 
 class Mark(NamedTuple):
