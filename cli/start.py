@@ -14,10 +14,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from importlib import import_module
-from typing import IO
+from typing import IO, Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 AGAIN_S = 2.0  # [s] `timeout` sends each signal twice; one that comes later than this is meant
+SOON_S = 0.01  # [s] until an interrupt that nobody could catch is raised again
 SAVING_S = 1.0  # [s] for a file that is being written
 TURN_S = 0.0005  # [s] that a thread of Python goes on while others wait
 # Address space that libraries take whatever is computed, from trials: half of it for commands that only read tables.
@@ -67,6 +68,7 @@ def answer(name: str) -> None:
     signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
     for number in SIGNALS:
         signal.signal(number, _handle)
+    sys.unraisablehook = _not_raised
 
 
 @contextlib.contextmanager
@@ -108,6 +110,16 @@ def _handle(number: int, _: object) -> None:
         if _first is None:
             _first, _since = number, time.monotonic()
         raise KeyboardInterrupt
+
+
+def _not_raised(lost: Any) -> None:
+    """Raise again, a little later, what was raised where Python only prints it: in a callback of the compiler, say."""
+    global _raises, _since
+    if _first is None or not issubclass(lost.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(lost)
+        return
+    _raises, _since = True, time.monotonic()
+    threading.Timer(SOON_S, signal.pthread_kill, (threading.main_thread().ident, _first)).start()
 
 
 def _listen(reading: int) -> None:

@@ -49,6 +49,19 @@ RAISED = """try:
     except KeyboardInterrupt:
         print("kept", start.interrupt_status())
 """
+CALLED_BACK = """import ctypes, os, signal, time
+    def called():
+        os.kill(os.getpid(), signal.SIGINT)
+        for _ in range(1000):
+            time.sleep(0.001)
+    callback = ctypes.CFUNCTYPE(None)(called)
+    try:
+        print("busy", flush=True)
+        callback()
+        time.sleep(60)
+    except KeyboardInterrupt:
+        print("kept", start.interrupt_status())
+"""
 
 
 @pytest.fixture
@@ -73,6 +86,12 @@ def test_one_long_instruction_is_interrupted(
     assert process.communicate(timeout=30)[1] == "tsdf-busy: error: interrupted: all is lost\n"
     assert process.returncode == 128 + number
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupt_within_a_callback_is_not_lost(busy: Callable[..., subprocess.Popen]) -> None:
+    """Python prints what is raised there and goes on; a compiler calls back each time it has made machine code."""
+    said = busy("lambda: None, raises=True", CALLED_BACK).communicate(timeout=30)
+    assert said == ("kept 130\n", "")
 
 
 def test_what_there_is_to_keep_is_waited_for(busy: Callable[..., subprocess.Popen], tmp_path: Path) -> None:

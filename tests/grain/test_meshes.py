@@ -5,6 +5,7 @@ import importlib.util
 import io
 import json
 import os
+import random
 import re
 import struct
 import sys
@@ -18,7 +19,7 @@ import pytest
 
 from tsdf.errors import GrainError
 from tsdf.grain.grains import embree_scene, first_hit, load_grain
-from tsdf.grain.meshes import READERS, read_mesh
+from tsdf.grain.meshes import READERS, _obj_by_lines, _plain_obj, read_mesh
 from tsdf.grain.polygons import Part, triangles_of
 
 FUZZ = Path(__file__).parents[2] / "fuzz" / "meshes.py"
@@ -117,6 +118,30 @@ CUBE_OBJ = obj(CUBE, CUBE_FACES)
 def test_obj_forms(text, tmp_path):
     grain = loaded(tmp_path, "cube.obj", text)
     assert size(grain) == pytest.approx((1, 6)) and grain.bounding_radius == pytest.approx(0.75**0.5)
+
+
+def test_plain_objs_are_read_as_line_by_line():
+    text = "# a box\nmtllib box.mtl\no box\n" + CUBE_OBJ.replace("f 1 ", "f 1/2/3 ") + "vn 0 0 1\ns off\n"
+    rng, plain = random.Random(3), 0
+    for k in range(1500):
+        data = text.replace("\n", rng.choice(("\n", "\r\n", "\r"))).encode()
+        data = fuzz.damaged(data, rng) if k else data
+        found = _plain_obj(data)
+        if found is not None:
+            plain += 1
+            for one, other in zip(found, _obj_by_lines(data), strict=True):
+                np.testing.assert_array_equal(one, other)
+    assert 200 < plain < 1200
+    for odd in (
+        "v 0 0 0 # where\n",
+        "v 0 0\n",
+        "f 1 2 -1\n",
+        "f 1 2 \\\n3\n",
+        "surf 0 1\n",
+        "v 0 0 nan\n",
+        "f 1 2 3e0\n",
+    ):
+        assert _plain_obj((text + odd).encode()) is None
 
 
 def test_obj_by_relative_indices(tmp_path):

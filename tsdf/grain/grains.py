@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from tsdf.errors import GrainError, UsageError
 from tsdf.grain.exemplars import EXEMPLARS
 from tsdf.grain.meshes import read_mesh
+from tsdf.grain.rounding import grid_step, grid_tilt, is_convex
 from tsdf.grain.surface import (
     MODELLER,
     Floats,
@@ -28,12 +29,9 @@ from tsdf.grain.surface import (
     bounding_sphere,
     closed_faces,
     compact,
-    equal_vertices,
     filled,
-    grid_step,
-    grid_tilt,
+    first_of_equals,
     half_edges,
-    is_convex,
     mesh_hash,
     oriented,
     outward,
@@ -77,7 +75,7 @@ class Grain:
         Surface area [R^2] and volume of the material [R^3], cavities' surface counted and their volume not.
     convex : bool
         One body of which no vertex stands further before the plane of a face than 1e-6 R and what the digits of the
-        file's coordinates explain; see `tsdf.grain.surface.is_convex`.
+        file's coordinates explain; see `tsdf.grain.rounding.is_convex`.
     bodies : int
         Number of separate solids.
     notes : tuple of str
@@ -219,12 +217,11 @@ def grain_from_mesh(
         return "({:.5g}, {:.5g}, {:.5g})".format(*(centre + scale * point))
 
     points = (points - centre) / scale
-    points, triangles = compact(points, equal_vertices(points)[triangles])
-    points, triangles = closed_faces(points, triangles, notes)
-
-    points, triangles = parted(points, triangles, name, place, notes)
-    half, edge, uses = half_edges(triangles)
-    triangles, shell = oriented(triangles, name, notes)
+    points, triangles = compact(points, first_of_equals(points)[triangles])
+    points, triangles, edges = closed_faces(points, triangles, notes)
+    points, triangles, edges = parted(points, triangles, edges, name, place, notes)
+    half, edge, uses = edges
+    triangles, shell = oriented(triangles, edges, name, notes)
     open_edges = int((uses == 1).sum())
     if open_edges:
         if not repair:
@@ -239,11 +236,11 @@ def grain_from_mesh(
     changed = open_edges > 0 or even is not triangles
     triangles = even
     if changed:
-        half, edge, uses = half_edges(triangles)
-    if len(triangles) == 0 or (uses != 2).any():
-        raise GrainError(f"{name}: {(uses != 2).sum()} edges cannot be closed; {MODELLER}")
+        edges = half_edges(triangles)
+    if len(triangles) == 0 or (edges.uses != 2).any():
+        raise GrainError(f"{name}: {(edges.uses != 2).sum()} edges cannot be closed; {MODELLER}")
     if changed:
-        triangles, shell = oriented(triangles, name, notes)
+        triangles, shell = oriented(triangles, edges, name, notes)
     triangles, shell = with_volume(points, triangles, shell, name, bool(repair), notes)
     triangles, bodies = outward(points, triangles, shell, name, place, notes)
 

@@ -1,4 +1,4 @@
-"""Closed surfaces: weld, close, orient and judge the triangles of a grain, and find their minimal bounding sphere.
+"""Closed surfaces: weld, close and orient the triangles of a grain, and find their minimal bounding sphere.
 
 Geometry on arrays of points and faces, with numpy alone, but for vertices that must be welded. Where the arrays come
 from and what is made of them is `grains`. Lengths are in units of about R, so that tolerances mean the same for a grain
@@ -7,8 +7,9 @@ of any size.
 
 import hashlib
 from collections import defaultdict
+from collections.abc import Sequence
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,10 +20,6 @@ from tsdf.grain.polygons import Part, triangles_of
 NEAR_WELD = 1e-6  # [R] vertices of open edges closer than this are one vertex
 SLIVER_HEIGHT = 1e-9  # [R] a face less high than this has no area
 FLAT_VOLUME = 1e-9  # volume / area^1.5 of a shell without volume; a sphere has 0.094
-CONVEX_TOLERANCE = 1e-6  # [R] how far a vertex may stand before a face's plane
-MOST_ROUNDING = 2e-6  # [R] coordinates rounded more coarsely than this cannot be told from a shape
-FEWEST_LEVELS = 8  # of coordinates along an axis that tell a grid from a few chosen values
-FEWEST_CORNERS = 64  # of a mesh whose coordinates are rounded rather than chosen
 MOST_SHELLS = 10_000  # the boxes of each are compared with each
 MOST_NESTED = 200_000  # pairs of shells of which one's box holds the other's
 MOST_PAIRS = 50_000_000  # of points and triangles, to tell which shells are inside which
@@ -39,15 +36,23 @@ ODDLY = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]  # turns w
 
 def compact(points: Floats, faces: Ints) -> tuple[Floats, Ints]:
     """Drop vertices that no face uses."""
-    used, index = np.unique(faces, return_inverse=True)
-    return points[used], index.reshape(-1, 3)
+    used = np.zeros(len(points), bool)
+    used[faces] = True
+    return points[used], (np.cumsum(used) - 1)[faces]
 
 
-def equal_vertices(points: Floats) -> Ints:
-    """Return for each vertex the first vertex at exactly its position."""
-    order = np.lexsort(points.T)  # stable: the first of equals stays first
-    new = np.r_[True, (np.diff(points[order], axis=0) != 0).any(axis=1)]
-    first = np.empty(len(points), np.int64)
+def _in_order(rows: NDArray[Any]) -> tuple[Ints, NDArray[np.bool_]]:
+    """Return the order of rows (n, k), in which equal ones stay as they stand, and which are new there."""
+    order = np.lexsort(rows.T[::-1])
+    new = np.ones(len(rows), bool)
+    new[1:] = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
+    return order, new
+
+
+def first_of_equals(rows: NDArray[Any]) -> Ints:
+    """Return for each row (n, k), of vertices say, the first that is exactly equal to it."""
+    order, new = _in_order(rows)
+    first = np.empty(len(rows), np.int64)
     first[order] = order[new][np.cumsum(new) - 1]
     return first
 
@@ -76,12 +81,21 @@ def connected(count: int, one: Ints, other: Ints) -> Ints:
     return first
 
 
-def half_edges(faces: Ints) -> tuple[Ints, Ints, Ints]:
-    """Return directed edges (3m, 2), face by face, the undirected edge (3m,) of each, and its uses."""
+class Edges(NamedTuple):
+    """Of m faces: half (3m, 2), directed, face by face; edge (3m,), which undirected one each is; the uses of these."""
+
+    half: Ints
+    edge: Ints
+    uses: Ints
+
+
+def half_edges(faces: Ints) -> Edges:
+    """Return the edges of faces (m, 3)."""
     half = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    key = half.min(axis=1) * (faces.max(initial=0) + 1) + half.max(axis=1)
+    start, end = half.T
+    key = np.minimum(start, end) * (faces.max(initial=0) + 1) + np.maximum(start, end)
     _, edge, uses = np.unique(key, return_inverse=True, return_counts=True)
-    return half, edge, uses
+    return Edges(half, edge, uses)
 
 
 def _edge_pairs(edge: Ints, uses: Ints) -> Ints:
@@ -92,51 +106,68 @@ def _edge_pairs(edge: Ints, uses: Ints) -> Ints:
 
 def area_normals(points: Floats, faces: Ints) -> Floats:
     """Return (m, 3) normals, as long as twice the area."""
-    a, b, c = points[faces].swapaxes(0, 1)
-    return np.cross(b - a, c - a)
+    return np.stack(_cross(*_sides(points, faces)[1:]), axis=1)
 
 
-def _heights(points: Floats, faces: Ints) -> Floats:
+def _sides(points: Floats, faces: Ints) -> Floats:
+    """Return (3, 3, m) the sides of faces that run from the second corner to the third, from the first to the second
+    and from the first to the third, by x, y, z: of large meshes numpy is several times as fast along m as across."""
+    a, b, c = np.ascontiguousarray(points.T)[:, faces.T].swapaxes(0, 1)
+    return np.stack((c - b, b - a, c - a))
+
+
+def _cross(one: Floats, other: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the cross products of vectors (3, m)."""
+    (a, b, c), (x, y, z) = one, other
+    return b * z - c * y, c * x - a * z, a * y - b * x
+
+
+def _squares(vectors: Sequence[Floats]) -> Floats:
+    """Return the squared lengths of vectors (3, m)."""
+    x, y, z = vectors
+    return x * x + y * y + z * z
+
+
+def heights(points: Floats, faces: Ints) -> Floats:
     """Return (m,) the height of each face over its longest edge."""
-    longest = np.linalg.norm(points[faces] - points[np.roll(faces, -1, axis=1)], axis=2).max(axis=1)
-    return np.linalg.norm(area_normals(points, faces), axis=1) / np.maximum(longest, 1e-300)
+    sides = _sides(points, faces)
+    longest = np.sqrt(np.maximum(np.maximum(*map(_squares, sides[:2])), _squares(sides[2])))
+    return np.sqrt(_squares(_cross(*sides[1:]))) / np.maximum(longest, 1e-300)
 
 
-def closed_faces(points: Floats, faces: Ints, notes: list[str]) -> tuple[Floats, Ints]:
+def closed_faces(points: Floats, faces: Ints, notes: list[str]) -> tuple[Floats, Ints, Edges]:
     """Remove collapsed and duplicate faces; weld near vertices if that leaves fewer open edges."""
 
     def distinct(faces: Ints) -> tuple[Ints, int, int]:
         real = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-        kept = np.sort(np.unique(np.sort(real, axis=1), axis=0, return_index=True)[1])
-        return real[kept], len(faces) - len(real), len(real) - len(kept)
-
-    def defects(faces: Ints) -> int:
-        return int((half_edges(faces)[2] != 2).sum())
+        kept = real[first_of_equals(np.sort(real, axis=1)) == np.arange(len(real))]
+        return kept, len(faces) - len(real), len(real) - len(kept)
 
     clean, collapsed, doubled = distinct(faces)
-    half, edge, uses = half_edges(clean)
+    edges = half_edges(clean)
+    half, edge, uses = edges
     if (uses == 1).any():
         rim = np.unique(half[uses[edge] == 1])
         first = _near_vertices(points, rim)
         welded, more, again = distinct(first[clean])
-        if (half_edges(welded)[2] == 1).sum() < (uses == 1).sum():
+        if ((found := half_edges(welded)).uses == 1).sum() < (uses == 1).sum():
             count = int((first != np.arange(len(points))).sum())
             notes.append(f"welded {count} vertices of open edges within {NEAR_WELD:g} R")
-            clean, collapsed, doubled = welded, collapsed + more, doubled + again
+            clean, edges, collapsed, doubled = welded, found, collapsed + more, doubled + again
     # Faces without area that hang on a closed surface go; those that are part of it are flipped away later.
-    flat = _heights(points, clean) < SLIVER_HEIGHT
-    if flat.any() and defects(clean[~flat]) < max(defects(clean), 1):
-        clean, collapsed = clean[~flat], collapsed + int(flat.sum())
+    flat = heights(points, clean) < SLIVER_HEIGHT
+    if flat.any() and ((found := half_edges(clean[~flat])).uses != 2).sum() < max((edges.uses != 2).sum(), 1):
+        clean, edges, collapsed = clean[~flat], found, collapsed + int(flat.sum())
     if collapsed:
         notes.append(f"removed {collapsed} degenerate faces")
     if doubled:
         notes.append(f"removed {doubled} duplicate faces")
-    return points, clean
+    return points, clean, edges
 
 
-def oriented(faces: Ints, name: str, notes: list[str]) -> tuple[Ints, Ints]:
+def oriented(faces: Ints, edges: Edges, name: str, notes: list[str]) -> tuple[Ints, Ints]:
     """Return the faces consistently wound, and the shell (m,) each belongs to."""
-    flip, shell = _wound(faces, _edge_pairs(*half_edges(faces)[1:]))
+    flip, shell = _wound(faces, _edge_pairs(edges.edge, edges.uses))
     if flip is None:
         raise GrainError(f"{name}: no consistent winding exists: the surface has one side only; {MODELLER}")
     if flip.any():
@@ -166,7 +197,9 @@ def _wound(faces: Ints, pairs: Ints) -> tuple[NDArray[np.bool_] | None, Ints]:
     return flip ^ mostly[shell], shell
 
 
-def parted(points: Floats, faces: Ints, name: str, place: Any, notes: list[str]) -> tuple[Floats, Ints]:
+def parted(
+    points: Floats, faces: Ints, edges: Edges, name: str, place: Any, notes: list[str]
+) -> tuple[Floats, Ints, Edges]:
     """Give solids that touch along an edge vertices of their own there, so that two faces meet at every edge.
 
     The faces about such an edge bound solid and void in turn; the two that bound one solid are joined. Where a solid
@@ -177,13 +210,12 @@ def parted(points: Floats, faces: Ints, name: str, place: Any, notes: list[str])
     GrainError
         Faces lie on each other or are odd in number: solids touch over a face, or there are inner walls.
     """
-    _, edge, uses = half_edges(faces)
-    count = int((uses > 2).sum())
+    count = int((edges.uses > 2).sum())
     if count == 0:
-        return points, faces
+        return points, faces, edges
     way_out = f"unite the bodies (Blender: Boolean, Union), or remove inner walls: {MODELLER}"
     for _ in range(2):
-        half, edge, uses = half_edges(faces)
+        half, edge, uses = edges
         about = np.flatnonzero(uses[edge] > 2)
         line = np.sort(half[about], axis=1)
         origin, along = points[line[:, 0]], points[line[:, 1]] - points[line[:, 0]]
@@ -213,12 +245,13 @@ def parted(points: Floats, faces: Ints, name: str, place: Any, notes: list[str])
         down = (half[about, 0] > half[about, 1]) ^ flip[about // 3]  # solid lies at larger angles
         joined = np.vstack([pairs, np.column_stack([about, about[ahead]])[down]])
         points, faces = _own_vertices(points, faces, joined)
-        _, edge, uses = half_edges(faces)
-        if not (uses > 2).any():
+        edges = half_edges(faces)
+        if not (edges.uses > 2).any():
             break
-        points, faces = _divided(points, faces, edge, uses > 2)
+        points, faces = _divided(points, faces, edges.edge, edges.uses > 2)
+        edges = half_edges(faces)
     notes.append(f"solids touch along {count} edges")
-    return points, faces
+    return points, faces, edges
 
 
 def _inside_out(points: Floats, faces: Ints, whole: Ints) -> NDArray[np.bool_]:
@@ -296,12 +329,12 @@ def without_slivers(points: Floats, faces: Ints, notes: list[str]) -> Ints:
 
     Its third corner lies on that edge; the flip splits the neighbour there. The surface stays as it is.
     """
-    thin = int((_heights(points, faces) < SLIVER_HEIGHT).sum())
+    thin = int((heights(points, faces) < SLIVER_HEIGHT).sum())
     if thin == 0:
         return faces
     faces = faces.copy()
     for _ in range(4 * thin):
-        flat = np.flatnonzero(_heights(points, faces) < SLIVER_HEIGHT)
+        flat = np.flatnonzero(heights(points, faces) < SLIVER_HEIGHT)
         if len(flat) == 0:
             break
         corners = faces[flat[0]]
@@ -441,106 +474,13 @@ def outward(points: Floats, faces: Ints, shell: Ints, name: str, place: Any, not
     return np.where(turn[shell][:, None], faces[:, ::-1], faces), bodies
 
 
-def is_convex(points: Floats, faces: Ints, rounding: float = 0.0) -> bool:
-    """Tell whether all of a mesh lies behind the plane of each of its faces, within what its digits allow.
-
-    A vertex may stand `CONVEX_TOLERANCE` before a plane. Where coordinates are rounded, the plane itself is uncertain,
-    the more the further from the face and the less high the face: 4 `rounding` (1 + distance / height) is added.
-
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Vertices [R].
-    faces : (m, 3) int64
-        Counter-clockwise seen from the void.
-    rounding : float
-        How far a coordinate may be off [R], from `grid_step`; more than `MOST_ROUNDING` counts as that.
-    """
-    from tsdf.grain.horizon import stand_before
-
-    normal = area_normals(points, faces)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    corners = points[faces]
-    level = np.einsum("ijk,ik->ij", corners, normal).max(axis=1)
-    rounding = min(rounding, MOST_ROUNDING)
-    slopes = 4 * rounding / _heights(points, faces)
-    tolerance = CONVEX_TOLERANCE + 4 * rounding
-    return not stand_before(points, np.column_stack([normal, level]), corners.mean(axis=1), slopes, tolerance).any()
-
-
-def grid_step(points: Floats) -> float:
-    """Return the largest step of a grid on which all coordinates stand for want of digits, 0 if there is none.
-
-    Numbers of float32 stand on a grid of the last bit of the largest of them, written decimals on a power of ten, and
-    numbers of either that were scaled afterwards on any; the last is looked for where an axis has eight levels or more.
-
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Vertices, as the file has them.
-    """
-    largest = float(np.abs(points).max())
-    with np.errstate(over="ignore"):  # what float32 cannot hold is not of float32
-        bits = 2.0**-23 if (points == points.astype(np.float32)).all() else 2.0**-52
-    unsure = bits * 2.0 ** np.floor(np.log2(max(largest, 1e-300)))  # the last bit of the largest
-    steps = [unsure if bits == 2.0**-23 else 0.0]
-    for power in range(int(np.floor(np.log10(max(largest, 1e-300)))), -300, -1):
-        step = 10.0**power
-        if step <= 100 * unsure:  # finer grids fit anything
-            break
-        if (np.abs(points - step * np.rint(points / step)) <= 2 * unsure).all():
-            steps.append(step)
-            break
-    axes = [_spacing(axis, unsure) for axis in points.T]
-    return max(*steps, max(axes) if min(axes) > 0 else 0.0)
-
-
-def _spacing(values: Floats, unsure: float) -> float:
-    """Return the common spacing of values that stand on eight levels of a grid or more, 0 if there is none."""
-    levels = np.unique(values)
-    gaps = np.diff(levels)
-    step = gaps[gaps > 8 * unsure].min(initial=np.inf)
-    if not np.isfinite(step):
-        return 0.0
-    step = (levels[-1] - levels[0]) / max(np.rint((levels[-1] - levels[0]) / step), 1.0)
-    rest = (levels - levels[0]) / step
-    enough = len(np.unique(np.rint(rest))) >= FEWEST_LEVELS
-    return float(step) if enough and (np.abs(rest - np.rint(rest)) < 0.02).all() else 0.0
-
-
-def grid_tilt(points: Floats, faces: Ints, step: float) -> float:
-    """Return by how much facets are tilted where coordinates are rounded to a grid, the mean over the area [rad].
-
-    A facet with heights h is tilted by sqrt(sum of 1 / h^2) step / sqrt(12) for independent corners. None is if the
-    grid is a design: facets along the axes (voxels), corners in the middle of a grid's edges (marching cubes on
-    binary data), or fewer than `FEWEST_CORNERS`.
-
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Vertices [R].
-    faces : (m, 3) int64
-    step : float
-        Of the grid [R].
-    """
-    if step == 0 or len(points) < FEWEST_CORNERS:
-        return 0.0
-    odd = np.rint((points - points.min(axis=0)) / step).astype(np.int64) % 2
-    for turned in np.ndindex(2, 2, 2):
-        if ((odd ^ turned).sum(axis=1) == 1).all():
-            return 0.0
-    normal = area_normals(points, faces)
-    double = np.linalg.norm(normal, axis=1)
-    sides = np.linalg.norm(points[faces] - points[np.roll(faces, -1, axis=1)], axis=2)
-    tilt = np.minimum(np.sqrt((sides**2).sum(axis=1)) / double * step / np.sqrt(12), 1.0)
-    tilt[np.abs(normal).max(axis=1) > (1 - 1e-9) * double] = 0.0
-    return float(np.average(tilt, weights=double))
-
-
 def mesh_hash(points: Floats, faces: Ints) -> str:
     """Return the hash defined under `Grain`."""
-    grid, index = np.unique(np.rint(points * 1e6).astype(np.int64), axis=0, return_inverse=True)
-    corners = index.reshape(-1)[faces]  # ranks of positions: their order is the order of the positions
+    places = np.rint(points * 1e6).astype(np.int64)
+    order, new = _in_order(places)
+    grid, rank = places[order[new]], np.empty(len(places), np.int64)
+    rank[order] = np.cumsum(new) - 1
+    corners = rank[faces]  # ranks of positions: their order is the order of the positions
     corners = np.take_along_axis(corners, (corners.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
     corners = corners[np.lexsort(corners.T[::-1])]
     return hashlib.sha256(grid[corners].astype("<i4").tobytes()).hexdigest()
