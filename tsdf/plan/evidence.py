@@ -446,7 +446,7 @@ class Evidence:
             straight = 0.0 if LEVELS[candidate.level].traits.points or not self.atoms else self.atoms * all_of_it
             found = min(found, straight)
         more = (self.rarer - 1.0) * found if self.rarer > 1.0 else 0.0
-        if more and not candidate.single:
+        if 0.0 < more < math.inf and not candidate.single:
             each = self.atoms * self.coverage / self.chance  # meetings of a sample, under the suns of pilots
             rare = Rare(more, each / self.rarer * self.pixels, math.sqrt(found * each))
         return seen._replace(variance=seen.variance + more), piloted, rare
