@@ -19,10 +19,10 @@ from typing import NamedTuple
 import numpy as np
 
 from tsdf.compiled import compiled_for, not_ahead
-from tsdf.errors import SceneError, UsageError
+from tsdf.errors import UsageError
 from tsdf.handle import Handle
 from tsdf.picture.trust import SHOWN, Moments, Trust, kurtosis_of
-from tsdf.picture.world import World, camera_of, sees
+from tsdf.picture.world import World, camera_of, check_sight
 from tsdf.scene.levels import LEVELS
 from tsdf.walk import bodies, lanes, packed, standing, transport
 from tsdf.walk import walker as W
@@ -269,10 +269,7 @@ def render(
         Set by others to end early; the picture then holds the samples so far.
     """
     camera = world.scene.camera
-    if not sees(world):
-        raise SceneError(
-            f"{world.scene.name}: a camera looking at nothing: it sees neither a medium nor a surface; move its target"
-        )
+    check_sight(world)
     return measure(
         world, camera_of(world), camera.width, camera.height, spp, seconds, target_error, seed, threads, progress, stop,
         world.met,

@@ -164,6 +164,14 @@ def sees(world: World) -> bool:
     return False
 
 
+def check_sight(world: World) -> None:
+    """Raise SceneError where the picture would show nothing of the scene, or paths would go on for ever."""
+    if not sees(world):
+        raise SceneError(
+            f"{world.scene.name}: a camera looking at nothing: it sees neither a medium nor a surface; move its target"
+        )
+
+
 def _shut_in(world: World, camera: CameraArrays) -> bool:
     """Return whether paths from the camera neither leave the scene nor end, if media were clear; by following some."""
     place, g = world.place, world.place.arrays

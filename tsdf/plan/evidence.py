@@ -12,7 +12,7 @@ from tsdf.picture.footprint import PER_E
 from tsdf.plan import beliefs, prior
 from tsdf.plan.beliefs import Belief
 from tsdf.plan.pilot import Apart, Pilot, Seen
-from tsdf.plan.prediction import Prediction
+from tsdf.plan.prediction import NOTHING, Prediction, Rare
 from tsdf.scene.levels import LEVELS
 from tsdf.study.candidates import Candidate, candidates
 from tsdf.walk.lights import LUMINANCE
@@ -25,6 +25,8 @@ LEAST_PER_E = 2.0  # explicit grains of facets that bring texture down by e, at 
 TOLD, LEAST_ALIKE = 3.0, 0.5  # standard errors from which on a candidate misses other texture than all do, and what
 # of that it misses at least
 ALIKE = 0.2  # of the logarithm of an error, what two levels of teleportation may differ by
+REGIONAL = 1.5  # times what levels are off by in slabs, that regions of a picture differ by
+DIFFERS = 0.07  # of the texture that all levels miss alike, by which they may differ and no pilot tell
 LEAST = 1e-4  # [1] of an error
 UNSURE = 0.8  # of the logarithm of texture, what that law may be off by for other grains than spheres
 FADING = 0.3  # of the logarithm of texture, what that law may be off by; and of what is left of a bias
@@ -123,7 +125,10 @@ class Evidence:
         bound = BOUND * (more - 1.0) * max(seen.square, 0.0)  # not all of it is glints, so this is rather too much
         # which facets mirror the real sun, of those that mirror a wider one, is chance, in a picture of few most of all
         luck = math.sqrt((more - 1.0) * more**2 * seen.fourth / self.pixels)
-        return seen._replace(square=more * seen.square, square_error=math.hypot(more * error, bound, luck))
+        mean = more * seen.square  # over pictures, of which few have most: half of them have less than this over
+        rare = math.hypot(1.0, luck / mean) if mean > 0.0 else 1.0
+        error = math.hypot(more * error, bound, luck)
+        return seen._replace(square=mean / rare, square_error=error, scale=more / rare)
 
     def unseen(self) -> float:
         """Return the square of texture that glints of flat facets may make which no pilot has met: one, of a facet that
@@ -148,11 +153,8 @@ class Evidence:
         if candidate.explicit_grains or best.looked.sum() <= own.looked.sum():
             return seen
         whole, part = best.apart(other), best.apart(other, own)
-        unsure = part.square_error + LEAST**2
-        alike = min((max(seen.square, 0.0) + unsure) / (max(part.square, 0.0) + unsure), 1.0)
-        square = seen.square + alike * (whole.square - part.square)
-        error = max(seen.square_error, alike * whole.square_error)
-        fourth = max(seen.fourth, alike**2 * whole.fourth)
+        square = seen.square + whole.square - part.square
+        error, fourth = max(seen.square_error, whole.square_error), max(seen.fourth, whole.fourth)
         return seen._replace(square=square, square_error=error, few=whole.few, fourth=fourth)
 
     @property
@@ -176,9 +178,12 @@ class Evidence:
             alike = self.seen_after(fewer) if fewer <= k else None  # what other chains miss then
             if later is None and alike is None:
                 continue
+            before = floor.value
             bias, bias_error, floor = self.faded(one, bias, bias_error, floor, base, fewer)
             if later is not None:
-                floor = beliefs.of_square(max(floor.value, LEAST), UNSURE, later.square, later.square_error)
+                unseen = max(1.0 - later.pixels / self.pixels, 0.0) * self.luck(before, floor.value)
+                error = math.hypot(later.square_error, unseen)
+                floor = beliefs.of_square(max(floor.value, LEAST), UNSURE, later.square, error)
                 bias, bias_error = beliefs.of_bias(max(bias_error, LEAST), later.bias, later.bias_error, bias)
             elif alike is not None:
                 square = alike.square - alike.bias**2 + bias**2 + bias_error**2  # which may be of either sign
@@ -190,11 +195,29 @@ class Evidence:
             bias_error, floor = self.bolder(candidate, bias_error, floor)
         floor = self.beside_the_reference(candidate, floor)
         texture, most = (math.sqrt(max(value**2 - bias**2, 0.0)) for value in (floor.value, floor.high))
-        seen, piloted = self.cost(candidate)
+        seen, piloted, rare = self.cost(candidate)
         turn = seen.seconds * self.pixels / self.threads
+        regions = 0.0 if candidate.single else self.of_regions(candidate, bias, bias_error)
         return Prediction(
-            candidate, bias, bias_error, texture, most - texture, floor, seen.variance, turn, piloted, known,
+            candidate, bias, bias_error, texture, most - texture, floor, seen.variance, turn, piloted, known, regions,
+            rare,
         )  # fmt: skip
+
+    def of_regions(self, candidate: Candidate, bias: float, bias_error: float) -> float:
+        """Return the error of means of regions, as high as it may well be: what the level that is expected to be least
+        off has of it, that is its bias, and how pilots of both differ. Neither has single grains, so this is known long
+        before texture is."""
+        alike = [c for c, p in self.pilots.items() if not c.single and c.leap is None and p.seen.mean > 0.0]
+        nearest = min(alike, key=lambda c: self.expected[c.level].bias, default=None)  # of as much, the first
+        own, one = self.pilots.get(candidate), self.expected[candidate.level]
+        if nearest is None or nearest == candidate:
+            return math.hypot(bias, bias_error)
+        square, error = own.regions(self.pilots[nearest]) if own is not None and own.each else (None, math.inf)
+        differs = beliefs.of_square(REGIONAL * one.bias, max(one.spread, 1e-9), square, error)
+        seen = self.apart(nearest)
+        wide = self.expected[nearest.level].bias
+        own_bias, own_error = beliefs.of_bias(wide, seen and seen.bias, seen.bias_error if seen else math.inf)
+        return math.hypot(own_bias, own_error, differs.high)
 
     def seen_after(self, k: int) -> Apart | None:
         """Return what pilots of chains with so many explicit grains first saw, by the one that knows it best: all miss
@@ -247,12 +270,12 @@ class Evidence:
         assert other is not None
         square = missed.value**2 + bias**2
         more = own.square - other.square - bias**2 + other.bias**2
-        noise = self.sparkle * math.hypot(own.own, other.own)
+        noise = other.scale * math.hypot(own.own, other.own)
         if own.pixels < other.pixels:  # which differ by what they look at as well
             noise = math.hypot(own.square_error, other.square_error)
         if abs(more) > TOLD * noise:
             square = max(square + more, (LEAST_ALIKE * missed.value) ** 2)
-        return Belief(math.sqrt(square), missed.error)
+        return Belief(math.sqrt(square), math.hypot(missed.error, DIFFERS * missed.value))
 
     def texture_of(self, best: Candidate) -> Belief:
         """Return the texture that a candidate without single grains misses, by its pilot."""
@@ -308,8 +331,8 @@ class Evidence:
     ) -> tuple[float, float, Belief]:
         """Return what is left of a bias, its error and a floor with k explicit grains, of one with fewer.
 
-        Texture falls by e for every `per_e` of them, and so does what it adds to the mean; what a level makes of all
-        packings alike falls as the share of grains that are still met at that level, of as many as light meets. Where
+        Texture falls by e for every `per_e` of them, and as the light that meets more grains yet, and so does what it
+        adds to the mean; what a level makes of all packings alike falls as that light, of as many as it meets. Where
         the first go by pixel, all pixels come to what the one is left with that has most.
         """
         if k == before:
@@ -317,8 +340,12 @@ class Evidence:
         off = min(math.hypot(bias, bias_error), floor.value)
         # light that a few bright paths bring does not get weaker with the grains that it has met, but rarer
         lasting = self.lasting * (1.0 - 0.5 * self.glinting)
-        rate = max(1.0 / self.per_e, lasting)
-        left = math.exp((before - k) * (self.fading or rate if before else rate))
+        rate = 1.0 / self.per_e + lasting  # as much less light is left, and it shows as much less
+        seen = self.fading if before else None
+        fall, kept = (k - before) * (seen or rate), 0.0
+        if seen is None:  # glints go straight on through parallel facets, as long as they do: which law holds is open
+            kept = 0.5 * self.glinting * max(fall - self.straight(k) + self.straight(before), 0.0)
+        left = math.exp(kept - fall)
         if self.far and not before:
             left = min(1.0, self.ratio * left)
         packing, alike = self.of_one_packing(one), math.exp((before - k) * self.lasting)
@@ -327,15 +354,38 @@ class Evidence:
         bias, bias_error = bias * less, math.hypot(bias_error, FADING * bias) * less
         texture = math.sqrt(max(floor.value**2 - off**2, 0.0)) * left
         value = math.hypot(texture, min(math.hypot(bias, bias_error), floor.value))
-        unsure = math.hypot(floor.error * left, FADING * texture)
+        luck = math.sqrt(texture**2 + self.luck(texture / left, texture)) - texture
+        unsure = math.hypot(floor.error * left, FADING * texture, math.expm1(kept) * texture, luck)
         return bias, bias_error, Belief(value, math.hypot(unsure, 0.5 * min(bias_error, value)))
+
+    def straight(self, k: int) -> float:
+        """Return how much less glints show, as a logarithm, of light that is deflected once and goes straight on
+        through all other grains that it meets, if that is more than k grains: where each lets a share a straight on, n
+        grains are met by n a^(n - 1) (1 - a)^2 of it."""
+        a = min(max(self.atoms, 1e-9), 0.95)
+        return -0.5 * (k * math.log(a) + math.log1p(k * (1.0 - a)))
+
+    def luck(self, texture: float, left: float) -> float:
+        """Return by how much the square of what explicit grains leave of texture may be off, because few pixels make
+        it: which of these they leave is chance."""
+        share = min((left / max(texture, LEAST)) ** 2, 1.0)
+        return texture**2 * math.sqrt(share * (1.0 - share) / max(self.glints, 1.0))
+
+    @property
+    def glints(self) -> float:
+        """How many pixels of the picture make most of what levels miss, by the pilot that knows it best."""
+        best = self.best_known()
+        seen = self.apart(best) if best is not None else None
+        if seen is None or not seen.fourth > 0.0 or not seen.square > RESOLVED * seen.scale * seen.noise:
+            return float(self.pixels)
+        return self.pixels * min((seen.square / seen.scale) ** 2 / seen.fourth / self.sparkle, 1.0)
 
     @property
     def glinting(self) -> float:
         """Which share of the square of what levels miss a few pixels make, beyond what they do of any texture [1]."""
         best = self.best_known()
         seen = self.apart(best) if best is not None else None
-        if seen is None or not seen.square > RESOLVED * self.sparkle * seen.noise:
+        if seen is None or not seen.square > RESOLVED * seen.scale * seen.noise:
             return 0.0
         return max(seen.few - USUAL, 0.0) / (1.0 - USUAL)
 
@@ -380,22 +430,26 @@ class Evidence:
         the last alike."""
         return -math.log1p(-1.0 / max(self.length, 1.05))
 
-    def cost(self, candidate: Candidate) -> tuple[Seen, bool]:
-        """Return variance and time of a sample, by its pilot or from those of others, and whether it was the former.
+    def cost(self, candidate: Candidate) -> tuple[Seen, bool, Rare]:
+        """Return variance and time of a sample, by its pilot or from those of others, whether it was the former, and
+        what of the variance only chance finds.
 
         Suns that only chance finds make as much more of the variance as they are smaller than in pilots: all of it, at
         most, of single grains, and of levels whose grains let a share of light go exactly straight on, along which
         nothing is aimed, that share of it.
         """
         seen, piloted = self.cost_of_pilots(candidate)
-        found = seen.variance
+        found, rare = seen.variance, NOTHING
         if not candidate.single:
             explicit = self.pilots.get(Candidate("explicit"))
             all_of_it = self.of_reference(explicit).variance if explicit is not None and explicit.each else math.inf
             straight = 0.0 if LEVELS[candidate.level].traits.points or not self.atoms else self.atoms * all_of_it
             found = min(found, straight)
         more = (self.rarer - 1.0) * found if self.rarer > 1.0 else 0.0
-        return seen._replace(variance=seen.variance + more), piloted
+        if 0.0 < more < math.inf and not candidate.single:
+            each = self.atoms * self.coverage / self.chance  # meetings of a sample, under the suns of pilots
+            rare = Rare(more, each / self.rarer * self.pixels, math.sqrt(found * each))
+        return seen._replace(variance=seen.variance + more), piloted, rare
 
     def cost_of_pilots(self, candidate: Candidate) -> tuple[Seen, bool]:
         """Return the same of the lights that pilots are under."""

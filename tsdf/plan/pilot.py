@@ -27,6 +27,7 @@ FREE = 0.25  # quantile of times that stands for a processor that has nothing el
 FEW = 50  # one pixel in so many may make most of a difference
 LATE = 6.0  # times what is asked for that it may take on the clock, where processors are busy with other things
 MANY = 4  # times as many samples of a pixel, that portions of two sizes tell what one more takes
+REGION = 16  # pixels that are looked at in a region
 HALVES = 2
 HALF = 1 << 40  # number of the first sample of the second half: one sample of a pixel is of one half in all pilots
 AT_ONCE = 1 << 15  # samples of a thread at once, at most
@@ -60,7 +61,8 @@ class Apart(NamedTuple):
     """How a pilot differs from another: of the mean, and the mean of the squared difference of pixels, without noise;
     over the other's mean [1], with standard errors, and what noise alone makes of the last of these. Of the square, the
     share that one pixel in `FEW` makes of which it is most, and the mean of its own square, what noise makes of its
-    error in these pixels, and how many these are."""
+    error in these pixels, and how many these are; and how many times what was seen the square is, where the picture has
+    smaller suns."""
 
     bias: float
     bias_error: float
@@ -71,6 +73,7 @@ class Apart(NamedTuple):
     fourth: float = 0.0
     own: float = 0.0
     pixels: int = 0
+    scale: float = 1.0
 
 
 class Mark(NamedTuple):
@@ -259,6 +262,27 @@ class Pilot:
         bias, bias_error = float(apart.mean()), math.sqrt(noisy + (all_of_it - noisy) * left)
         fourth = float((product**2).mean())
         return Apart(bias, bias_error, float(product.mean()), max(error, unsure), unsure, few, fourth, own, n)
+
+    def regions(self, other: "Pilot") -> tuple[float, float]:
+        """Return the mean of the squared difference of regions of the picture to another, of `REGION` pixels that both
+        looked at in each, without noise, over the other's mean [1], and its standard error."""
+        n = min(len(self.pixels), len(other.pixels))
+        both = self.looked[:n] & other.looked[:n]
+        camera = self.world.scene.camera
+        across = max(math.sqrt(REGION * camera.width * camera.height / max(int(both.sum()), 1)), 1.0)
+        y, x = np.divmod(self.pixels[:n][both], camera.width)
+        _, which = np.unique(
+            (y / across).astype(np.int64) * camera.width + (x / across).astype(np.int64), return_inverse=True
+        )
+        counts = np.bincount(which)
+        halves = []
+        for half in range(HALVES):
+            apart = (self.pixel_means(half)[:n] - other.pixel_means(half)[:n])[both] / other.seen.mean
+            halves.append(np.stack([np.bincount(which, channel) for channel in apart.T], axis=1) / counts[:, None])
+        product = (halves[0] * halves[1]).mean(axis=1)
+        share = counts / counts.sum()
+        square = float(share @ product)
+        return square, math.sqrt(float(share**2 @ (product - square) ** 2) * len(product) / max(len(product) - 1, 1))
 
     def _beside(
         self, other: "Pilot", both: np.ndarray, mean: float, met: float

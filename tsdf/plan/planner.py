@@ -6,7 +6,7 @@ What is expected of a scene is `prior`, what short renders of it show is `pilot`
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from threading import Event
 
@@ -14,11 +14,12 @@ from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
 from tsdf.errors import SceneError, UsageError
 from tsdf.picture.trust import kurtosis_of
-from tsdf.picture.world import World, build
+from tsdf.picture.world import World, build, check_sight
 from tsdf.plan import needs, prior
+from tsdf.plan.choice import Wish, choose
 from tsdf.plan.evidence import BOLD, BOLD_BIAS, GRAINS, MEETINGS, Evidence
 from tsdf.plan.pilot import CLOCKS, FEWEST, HALVES, MORE, PIXELS, Clocks, Pilot
-from tsdf.plan.prediction import TIE, UNFINISHED, Plan, Prediction
+from tsdf.plan.prediction import Plan, Prediction
 from tsdf.plan.report import BUSY, digits, why
 from tsdf.scene.levels import LEVELS
 from tsdf.scene.medium import Component, free_path
@@ -157,6 +158,7 @@ class _Planning(Evidence):
         self.packings: dict[bool, Packed] = {}
         self.wide = WIDE  # [deg] of suns in pilots, at least
         self.real = 0.0  # `chance` of the suns of the picture
+        self.regional = False  # whether the choice is by the error of regions
         self.dear = False  # whether single grains cannot be piloted
 
     def plan(self) -> Plan:
@@ -191,27 +193,10 @@ class _Planning(Evidence):
         made = Plan(
             self.asked, self.target, self.limit if self.said or beyond else None, (chosen, *rest), far, (),
             tuple(lacking), tuple(self.notes), self.spent, self.clocks.wall() - self.began, self.compiling,
-            self.threads, self.load, self.spp, self.drowned(chosen, rest) if beyond else 0.0,
-            2.0 / max(self.footprint, 1e-6), self.places, self.packings,
+            self.threads, self.load, self.spp, self.load * self.wish.glints(chosen, rest) if beyond else 0.0,
+            2.0 / max(self.footprint, 1e-6), self.regional, self.places, self.packings,
         )  # fmt: skip
         return replace(made, why=why(made, self.bodies, self.footprint, self.coverage, str(self.reference)))
-
-    def drowned(self, chosen: Prediction, others: Sequence[Prediction]) -> float:
-        """Return from when on single grains are taken [s] that have less error than the chosen but are left out, as
-        mostly noise; 0 where there are none."""
-        limit = self.limit / self.load
-        left_out = [
-            p for p in others if self.unfinished(p) and TIE * p.likely_error(limit) < chosen.likely_error(limit)
-        ]
-        return self.load * min((p.variance * p.turn / UNFINISHED**2 for p in left_out), default=0.0)
-
-    def unfinished(self, p: Prediction) -> bool:
-        """Return whether single grains under small suns are still but bright dots after the time that there is."""
-        return self.rarer > 1.0 and p.candidate.single and p.noise(self.able(p)) > UNFINISHED
-
-    def able(self, p: Prediction) -> float:
-        """Return the time that there is [s], or that the samples asked for take."""
-        return self.limit / self.load if self.spp is None else p.turn * self.spp
 
     def settled(self) -> tuple[Prediction, list[Prediction]]:
         """Return what is chosen, which a pilot has seen where one can, and all predictions."""
@@ -257,6 +242,7 @@ class _Planning(Evidence):
         if all(medium.inside == "grains" for medium in self.scene.media):
             self.places = dict.fromkeys((False, True), place(self.scene, grains=True))  # one for all levels
         world = build(self.scene, "volume", leap=0.0, places=self.places)
+        check_sight(world)
         if world.empty:
             self.refuse(world)
         self.bodies = prior.bodies(world, self.tables)
@@ -540,47 +526,15 @@ class _Planning(Evidence):
         """Return the time to the target [s] if the floor is as low as it may well be."""
         return p.seconds(self.target, max(p.floor.value - 1.5 * p.floor.error, 0.0))
 
-    # ---------------------------------------------------------------------------------------------- the choice
+    @property
+    def wish(self) -> Wish:
+        """What the picture is to be like."""
+        return Wish(self.target, self.limit / self.load, self.spp, self.rarer > 1.0, self.dear)
 
     def choose(self, found: list[Prediction]) -> Prediction:
-        """Return the cheapest that is sure enough to meet the target; if there is a time and none does, the one with
-        the least error in it, of those that aim at small suns. With so many samples it is the cheapest of those whose
-        noise is about the least, or small enough, and that miss less than the target. None is taken of whose noise
-        nothing is known, unless nothing is of any."""
-        found = [p for p in found if math.isfinite(p.variance)] or found
-        if self.dear:  # what few samples have told of paths that long is not what they take
-            found = [p for p in found if not LEVELS[p.candidate.level].traits.answered] or found
-        if self.spp is not None:
-            after = {p.candidate: p.likely_error(self.able(p)) for p in found}
-            aimed = [p for p in found if not self.unfinished(p)] or found
-            enough = max(self.target, TIE * min(after[p.candidate] for p in aimed))
-            alike = [p for p in aimed if after[p.candidate] <= enough] or aimed  # of pilots without light
-            fit = [p for p in alike if p.floor.high < self.target]
-            return min(fit, key=lambda p: p.turn) if fit else safest(alike, lambda p: p.floor.high)
-        best = min(found, key=lambda p: p.safe_seconds(self.target))
-        takes = best.safe_seconds(self.target)
-        limit = self.limit / self.load
-        if not takes <= limit and math.isfinite(limit):
-            # sparkle that is not rendered to the end is nothing but noise; and what all miss tells none from the others
-            aimed = [p for p in found if not self.unfinished(p) and p.turn <= limit]
-            aimed = aimed or [p for p in found if not self.unfinished(p)] or found
-            least = min(p.likely_error(limit) for p in aimed)
-            alike = [p for p in aimed if p.likely_error(limit) <= TIE * least] or aimed  # of pilots without light
-            return safest(alike, lambda p: math.hypot(p.bias, p.bias_error, p.noise(limit)))
-        if math.isinf(takes):
-            return safest(found, lambda p: p.floor.high)
-        alike = [p for p in found if p.safe_seconds(self.target) <= TIE * takes]
-        return min(alike, key=lambda p: p.floor.high)
-
-
-def safest(some: Sequence[Prediction], error: Callable[[Prediction], float]) -> Prediction:
-    """Return the one with the least error; of those that have as little as can be told, that which models most."""
-    least = TIE * min(error(p) for p in some)
-    order = list(LEVELS)
-    return min(
-        (p for p in some if not error(p) > least),  # of pilots without light nothing is
-        key=lambda p: (order.index(p.candidate.level), -p.candidate.explicit_grains),
-    )
+        """Return what is taken of these."""
+        one, self.regional = choose(found, self.wish)
+        return one
 
 
 def loaded(scene: Scene) -> tuple[Scene, list[Table]]:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 from tsdf.plan.beliefs import Belief
 from tsdf.scene.scene import Scene
@@ -13,6 +14,24 @@ TIE = 1.1  # times as long as the cheapest as it may take, of those the one with
 
 UNFINISHED = 0.5  # [1] noise of pixels over their mean, above which single grains under small suns are but bright dots
 BLOCK = 16  # pixels across, of whose means the error is said where that of a pixel says little
+HALF = math.log(2.0)  # meetings that are expected, below which it is likelier than not that there is none
+
+
+class Rare(NamedTuple):
+    """Light that only chance finds, of a level that aims at all else: a sun behind parallel facets.
+
+    Until a whole picture is likely to have met it once it is not noise there but missing.
+    """
+
+    variance: float = 0.0  # its part of a sample's variance
+    meetings: float = 0.0  # with it in a sample of each pixel
+    light: float = 0.0  # its share of the picture's mean
+
+    def __bool__(self) -> bool:
+        return self.variance > 0.0
+
+
+NOTHING = Rare()
 
 
 @dataclass(frozen=True)
@@ -34,6 +53,11 @@ class Prediction:
         Whether it was rendered, or follows from others that were.
     known : bool
         Whether the atlas covers the scene, or a pilot tells.
+    regions : float
+        Error of the means of regions of the picture, root mean square, that time does not bring down, of a level
+        without single grains: as its bias, but what is too bright here does not make up for what is too dark there.
+    rare : Rare
+        What of the variance only chance finds.
     """
 
     candidate: Candidate
@@ -46,20 +70,38 @@ class Prediction:
     turn: float
     piloted: bool
     known: bool
+    regions: float = 0.0
+    rare: Rare = NOTHING
+
+    def meets(self, seconds: float) -> bool:
+        """Return whether what only chance finds is more likely than not to be met within so long [s]."""
+        return self.rare.meetings * seconds >= HALF * self.turn
+
+    def variance_within(self, seconds: float) -> float:
+        """Return the variance of a sample [1] as a picture of so long has it [s]."""
+        return self.variance if not self.rare or self.meets(seconds) else self.variance - self.rare.variance
 
     def noise(self, seconds: float) -> float:
         """Return the standard error of pixels after so long [s]."""
-        return math.sqrt(self.variance * self.turn / seconds)
+        return math.sqrt(self.variance_within(seconds) * self.turn / seconds)
 
     def error(self, seconds: float) -> float:
         """Return the whole error after so long [s]."""
-        return math.hypot(self.floor.value, self.noise(seconds))
+        unmet = 0.0 if not self.rare or self.meets(seconds) else self.rare.light
+        return math.hypot(self.floor.value, self.noise(seconds), unmet)
 
     def error_of_blocks(self, seconds: float, across: float) -> float:
         """Return the whole error of the means of `BLOCK` by `BLOCK` pixels after so long [s], if what it misses is
         alike in so many of them across."""
         patches = min(max(across, 1.0) / BLOCK, 1.0)
-        return math.hypot(self.bias, self.texture * patches, self.noise(seconds) / BLOCK)
+        return math.hypot(self.texture * patches, self.error_of_regions(seconds))
+
+    def error_of_regions(self, seconds: float) -> float:
+        """Return the error of the means of `BLOCK` by `BLOCK` pixels after so long [s], but for texture that they miss:
+        of light that few of them have met either its noise or that it is missing, whichever is less."""
+        steady = math.sqrt((self.variance - self.rare.variance) * self.turn / seconds) / BLOCK
+        rare = min(math.sqrt(self.rare.variance * self.turn / seconds) / BLOCK, self.rare.light)
+        return math.hypot(max(abs(self.bias), self.regions), steady, rare)
 
     def likely_error(self, seconds: float) -> float:
         """Return the root mean square of the whole error after so long [s], over what the floor may be."""
@@ -68,6 +110,10 @@ class Prediction:
     def seconds(self, target: float, floor: float | None = None) -> float:
         """Return the time to an error [s], infinite where it is out of reach; `floor` instead of what is believed."""
         left = target**2 - (self.floor.value if floor is None else floor) ** 2
+        if self.rare and left > self.rare.light**2:
+            soon = (self.variance - self.rare.variance) * self.turn / (left - self.rare.light**2)
+            if not self.meets(soon):
+                return soon
         return self.variance * self.turn / left if left > 0.0 else math.inf
 
     def safe_seconds(self, target: float) -> float:
@@ -114,6 +160,8 @@ class Plan:
         their glints [s]; 0 where none are.
     grain : float
         How many pixels a grain looks across, about.
+    regional : bool
+        Whether the choice is by the error of regions: all that is left misses alike in pixels.
     places, packings : dict
         Geometry and packed grains of the scene as far as they were made, for `tsdf.picture.world.build`.
     """
@@ -134,6 +182,7 @@ class Plan:
     spp: int | None = None
     glints: float = 0.0
     grain: float = 1.0
+    regional: bool = False
     places: dict[bool, Place] = field(default_factory=dict)
     packings: dict[bool, Packed] = field(default_factory=dict)
 

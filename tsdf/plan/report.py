@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from tsdf.plan.choice import SWAMPED
 from tsdf.plan.prediction import BLOCK, TIE, UNFINISHED, Plan, Prediction
 from tsdf.plan.prior import Body
 
@@ -83,17 +84,12 @@ def _first(plan: Plan) -> str:
     if math.isinf(p.variance):
         return f"take {p.candidate}{far}: nothing is known of its noise"
     if plan.spp is not None:
-        after = f"an error of {percent(math.hypot(p.floor.value, math.sqrt(p.variance / plan.spp)))}"
+        after = f"an error of {percent(p.error(p.turn * plan.spp))}"
         after += f" with {plan.spp} samples per pixel"
         met = f"{percent(p.floor.value)} of it is not noise"
     elif plan.seconds is not None and plan.able is not None:
         after = f"an error of {percent(p.error(plan.able))} after {span(plan.seconds)}"
-        met = f"none is sure to meet {percent(plan.target)} in that time, and "
-        if plan.glints:
-            met += "single grains, which meet suns by chance, would be mostly noise until "
-            met += f"{span(plan.glints)}, so their glints are left out"
-        else:
-            met += "no other that was looked at is likely to have a tenth less"
+        met = f"none is sure to meet {percent(plan.target)} in that time, and {_left(plan, plan.able)}"
         if takes <= plan.able:
             met = f"{percent(plan.target)} after {_about(takes)}"
     elif math.isinf(takes):
@@ -110,13 +106,27 @@ def _first(plan: Plan) -> str:
     return f"take {p.candidate}{far}: {after} ({met})"
 
 
+def _left(plan: Plan, able: float) -> str:
+    """Return what decides in a time in which no candidate meets the target."""
+    p, glints = plan.chosen, ""
+    if plan.glints:
+        glints = "single grains, which meet suns by chance, would be mostly noise until "
+        glints += f"{span(plan.glints)}, so their glints are left out"
+    if plan.regional:
+        alike = "what all without single grains miss alike does not tell them apart: beside it means of "
+        alike += f"{BLOCK} by {BLOCK} pixels are off by {percent(p.error_of_regions(able))}, about the least of all "
+        alike += "with as much error"
+        return f"{glints}; {alike}" if glints else alike
+    return glints or "no other that was looked at is likely to have a tenth less"
+
+
 def _of_blocks(plan: Plan) -> str | None:
     """Return the error of means of many pixels, where that of one is so large that it says little."""
     p = plan.chosen
     seconds = p.turn * plan.spp if plan.spp is not None else plan.able
     if seconds is None:
         seconds = p.seconds(plan.target)
-    if not (seconds > 0.0 and p.error(seconds) > MEANINGFUL):
+    if plan.regional or not (seconds > 0.0 and p.error(seconds) > MEANINGFUL):
         return None
     return percent(p.error_of_blocks(seconds, plan.grain))
 
@@ -126,7 +136,7 @@ def to_noise(plan: Plan, noise: float) -> str:
     p = plan.chosen
     if not 0.0 < p.variance < math.inf:
         return _first(plan)
-    after = _about(p.variance * p.turn / noise**2)
+    after = _about(p.seconds(noise, 0.0))
     missed = f"beside which it misses {percent(p.floor.value)}" if p.floor.high else "and nothing else is wrong"
     return f"take {p.candidate}: noise of {percent(noise)} after {after}, {missed}"
 
@@ -142,8 +152,12 @@ def _reason(plan: Plan, bodies: Sequence[Body], footprint: float, coverage: floa
     which = f", the thickest of {len(bodies)}" if len(bodies) > 1 else ""
     of = f"{100.0 * body.packing_fraction:.3g} % of a body{which}, 2 V/S = {thick}"
     where = f"{seen} that fill {of}"
-    turn = chosen.variance * chosen.turn
-    worse = [p for p in plan.predictions[1:] if p.variance * p.turn < turn and p.floor.high > 0.0]
+    after = plan.able if plan.able is not None else chosen.seconds(plan.target)
+    if plan.spp is not None:
+        after = chosen.turn * plan.spp
+    after = after if 0.0 < after < math.inf else 1.0
+    noise = chosen.noise(after)
+    worse = [p for p in plan.predictions[1:] if p.noise(after) < noise and p.floor.high > 0.0]
     nearest = min(worse, key=lambda p: p.floor.value, default=None)
     than = f"; {short(nearest)}, and is faster to the same noise" if nearest is not None else "; nothing takes less"
     return f"because {where}; {short(chosen)}{than}"
@@ -183,11 +197,19 @@ def _short_of_time(plan: Plan, able: float) -> str:
     assert plan.seconds is not None
     known = [p for p in plan.predictions[1:] if math.isfinite(p.variance)] or plan.predictions[1:]
     done = [p for p in known if not (plan.glints and p.candidate.single and p.noise(able) > UNFINISHED)] or known
-    second = min(done, key=lambda p: p.likely_error(able))
-    alike = math.hypot(plan.chosen.floor.error, second.floor.error)
-    runner = f"runner-up: {second.candidate}, an error of {percent(second.error(able))} then"
-    if abs(second.error(able) - plan.chosen.error(able)) < alike:
-        runner += ", which is the same as far as can be told"
+    if plan.regional:
+        some = [p for p in done if not p.candidate.single]
+        enough = SWAMPED * min((p.likely_error(able) for p in some), default=0.0)
+        some = [p for p in some if not p.likely_error(able) > enough]
+        second = min(some or done, key=lambda p: p.error_of_regions(able))
+        off = percent(second.error_of_regions(able))
+        runner = f"runner-up: {second.candidate}, an error of {percent(second.error(able))}, of such means {off}"
+    else:
+        second = min(done, key=lambda p: p.likely_error(able))
+        runner = f"runner-up: {second.candidate}, an error of {percent(second.error(able))} then"
+        alike = math.hypot(plan.chosen.floor.error, second.floor.error)
+        if abs(second.error(able) - plan.chosen.error(able)) < alike:
+            runner += ", which is the same as far as can be told"
     best = min(plan.predictions, key=lambda p: p.safe_seconds(plan.target))
     takes = best.safe_seconds(plan.target) * plan.load
     if not math.isfinite(takes):
