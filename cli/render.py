@@ -220,10 +220,8 @@ def fireflies(picture: "Picture") -> str | None:
     if share < OF_DOTS:
         return None
     middle = math.sqrt(float(each[each.size // 2])) / mean
-    return (
-        f"its noise is bright dots: 1 % of the lit pixels make {100.0 * share:.0f} % of it, half of them are off by "
-        f"less than {middle:.2g} of their mean"
-    )
+    half = f"are off by less than {middle:.2g} of their mean" if middle > 0.0 else "have none that can be told yet"
+    return f"its noise is bright dots: 1 % of the lit pixels make {100.0 * share:.0f} % of it, half of them {half}"
 
 
 def fewer_dots(world: "World") -> str:

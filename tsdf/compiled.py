@@ -193,6 +193,15 @@ def stamp(name: str) -> str:
     return digest.hexdigest()
 
 
+@cache
+def _whole() -> str:
+    """Return the SHA-256 of the text of the package, of which kernels elsewhere may be made."""
+    digest = hashlib.sha256()
+    for file in sorted(PACKAGE.rglob("*.py")):
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
 def private_folder() -> Path | None:
     """Return this user's folder for machine code among the temporary files, None where it could be another's."""
     try:
@@ -296,7 +305,7 @@ class _Stamped:
 
     def get_source_stamp(self) -> Any:
         name = _module_of(self._py_file)
-        return super().get_source_stamp() if name is None else stamp(name)  # type: ignore[misc]
+        return (super().get_source_stamp(), _whole()) if name is None else stamp(name)  # type: ignore[misc]
 
 
 class _Given(_Stamped, caching.UserProvidedCacheLocator):

@@ -158,3 +158,24 @@ def test_each_file_is_read_once(tmp_path, ball, monkeypatch):
     made = world.build(scene, "teleport")
     assert len(reads) == 1
     assert math.isfinite(render.render(made, spp=1).rgb.sum())
+
+
+@pytest.mark.parametrize("shape", ["box", "sphere", "mesh", "surface"])
+def test_what_is_smaller_than_a_pixel_is_seen(shape, ball, tmp_path):
+    """Between the middles of all pixels; turned away by a picture's width, the camera sees nothing of it."""
+    import trimesh
+
+    low, high = (20.0, -0.01, -0.01), (20.02, 0.01, 0.01)
+    trimesh.creation.box(bounds=(low, high)).export(tmp_path / "speck.ply")
+    small = {
+        "box": Box(low, high),
+        "sphere": Sphere((20.0, 0.0, 0.0), 0.01),
+        "mesh": Mesh(tmp_path / "speck.ply"),
+        "surface": Rectangle((20.0, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01)),
+    }[shape]
+    media = () if shape == "surface" else (MediumSpec(small, 0.5, 1e-4, (GrainSpec(ball),), name="speck"),)
+    surfaces = (SurfaceSpec(small, (0.5,) * 3),) if shape == "surface" else ()
+    made = world.build(Scene(CAMERA, ONE, media, surfaces, name="speck"), "teleport")
+    assert world.sees(made)
+    away = replace(CAMERA, target=(0.6, 1.0, 0.0))
+    assert not world.sees(world.build(Scene(away, ONE, media, surfaces, name="speck"), "teleport"))

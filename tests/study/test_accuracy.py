@@ -17,9 +17,10 @@ from tsdf.errors import SceneError, UsageError
 from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Effort, exact_sphere
+from tsdf.picture import world
 from tsdf.scene.levels import LEVELS
 from tsdf.scene.medium import Component, volume_parameters
-from tsdf.scene.scene import Absorption, GrainSpec
+from tsdf.scene.scene import Absorption, GrainSpec, Slab, Sphere
 from tsdf.study import accuracy, experiment, plots
 from tsdf.study.accuracy import diffusion, measure, slab
 from tsdf.study.experiment import Experiment, Sums, gather, slab_experiment
@@ -132,28 +133,33 @@ def test_the_same_numbers_for_any_threads(grain: GrainSpec) -> None:
 
 
 @pytest.mark.parametrize("level", ["teleport", "volume-hg"])
-def test_slabs_in_lanes_are_the_same_path_by_path(
-    level: str, grain: GrainSpec, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("shape", ["slab", "ball"])
+def test_paths_in_lanes_are_as_one_by_one(
+    level: str, shape: str, grain: GrainSpec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As one by one: where each began, the line on which it came out, its weight, what it crossed; some are handed
-    over. Control: another seed's are others."""
+    """Path by path: where each began and came out, which way, its weight, what it crossed; some are handed over.
+    Control: another seed's are others."""
     dark = replace(grain, absorption=Absorption("grey", (0.2,)))
-    one = slab_experiment(level, dark, 0.5, 8.0)
-    few = replace(one.world, media=one.world.media._replace(limit=40))
+    body = Slab(-8.0, 0.0) if shape == "slab" else Sphere((0.0, 0.0, -5.0), 5.0)
+    made = world.build(experiment.scene_of(body, dark, 0.5), level, leap=0.0)
+    few = replace(made, media=made.media._replace(limit=40))
+    camera = experiment.beam(made, (0.0, 0.0, 5.0), (0.0, 0.0, -1.0))
 
-    def taken(seed: int = 1) -> tuple[np.ndarray, experiment.Ends]:
-        _, ends = experiment.follow(few, one.camera, 3000, seed, threads=1)
-        return one.read(np.zeros(0), ends), ends
+    def taken(seed: int = 1) -> experiment.Ends:
+        return experiment.follow(few, camera, 3000, seed, threads=1)[1]
 
-    (found, ends), (other, _) = taken(), taken(2)
+    def all_of(ends: experiment.Ends) -> np.ndarray:
+        return np.column_stack((ends.place, ends.direction, ends.weight, ends.amounts))[wanted.weight > 0.0]
+
+    found, other = taken(), taken(2)
     with monkeypatch.context() as patch:
         patch.setattr(experiment.lanes, "suited", lambda *_: False)
-        expected, wanted = taken()
-    assert (np.abs(found - expected) < 1e-9).all(axis=1).mean() > 0.999
-    assert (np.abs(found - other) < 1e-9).all(axis=1).mean() < 0.9
-    assert np.array_equal(ends.start, wanted.start) and abs(ends.events / wanted.events - 1.0) < 1e-3
-    out = (wanted.weight > 0.0) & (np.abs(found - expected) < 1e-9).all(axis=1)
-    assert ends.amounts[out] == pytest.approx(wanted.amounts[out], rel=1e-9) and out.mean() > 0.5
+        wanted = taken()
+    assert (wanted.weight > 0.0).mean() > 0.5 and ((wanted.weight > 0.0) == (found.weight > 0.0)).mean() > 0.999
+    far = 1e-6  # one by one they end a little beyond the boundary, more so along it
+    assert (np.abs(all_of(found) - all_of(wanted)) < far).all(axis=1).mean() > 0.999
+    assert (np.abs(all_of(other) - all_of(wanted)) < far).all(axis=1).mean() < 0.1
+    assert np.array_equal(found.start, wanted.start) and abs(found.events / wanted.events - 1.0) < 1e-3
 
 
 def test_absorption_can_be_taken_off_afterwards(table: Table, grain: GrainSpec) -> None:

@@ -88,3 +88,34 @@ def test_spheres_whose_ellipsoid_is_missed() -> None:
     lane = np.where(found == NONE, -1, found & (LANES - 1))
     assert (lane == wanted)[sure].mean() > 0.999  # two may be entered at nearly the same place
     assert 0.1 < (found == NONE)[alone != NONE].mean() < 0.95
+
+
+@pytest.mark.parametrize("aspect", [0.02, 4.0, 30.0])
+def test_no_ray_that_meets_a_grain_is_turned_away(aspect: float) -> None:
+    """Rays at its corners and edges, half of them along the ellipsoid. Control: one a hundredth smaller loses some."""
+    rng, many = np.random.default_rng(7), 4000
+    grain = load_grain("hexprism", aspect=aspect)
+    matrix, offset = ellipsoid_of(grain.vertices)
+    lost = np.zeros(2, int)
+    for turned in rotations(4):
+        corners = grain.vertices[grain.faces[rng.integers(len(grain.faces), size=many)]]
+        weights = rng.dirichlet((0.3, 0.3, 0.3), many)
+        weights[::2] = np.eye(3)[rng.integers(3, size=len(weights[::2]))]
+        x = np.einsum("nk,nkj->nj", weights, corners)
+        normal = (x @ matrix.T + offset) @ matrix
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        d = rng.normal(size=(many, 3))
+        along = rng.random(many) < 0.5
+        d[along] -= (np.einsum("ij,ij->i", d, normal)[:, None] * normal)[along]
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        x, d = x @ turned.T, d @ turned.T
+        starts = x - 3.0 * d
+        deep = 1.0 - (starts**2).sum(axis=1) + np.einsum("ij,ij->i", starts, d) ** 2 > 1e-5  # enough for float32
+        for k, size in enumerate((1.0, 1.01)):
+            block = np.full((ROWS, LANES), 1e6, np.float32)
+            block[:3, 0] = 0.0
+            block[4:, 0] = rows_of(size * matrix[None], size * offset[None], turned[None])[0]
+            found = np.zeros(many, np.int32)
+            first(block, starts, d, found, True)
+            lost[k] += int((deep & (found == NONE)).sum())
+    assert lost[0] == 0 and lost[1] > 0

@@ -9,6 +9,7 @@ light goes between two grains is not here.
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -158,6 +159,12 @@ def compile_tables(tables: Sequence[Table], joint: bool = False) -> Tables:
     UsageError
         If there is no table, if a column with light has nothing to draw from, or if records are asked for and missing.
     """
+    return _compiled(tuple(tables), joint)
+
+
+@lru_cache(maxsize=2)
+def _compiled(tables: tuple[Table, ...], joint: bool) -> Tables:
+    """Return what `compile_tables` does; experiments ask for the same over and over."""
     if not tables:
         raise UsageError("there is no table to draw from: give at least one")
     for table in tables:

@@ -45,12 +45,13 @@ from tsdf.scene.specs import SPP
 from tsdf.spheres.packing_table import law
 from tsdf.vectors import frame
 from tsdf.walk.explicit import Packed, nothing_packed, packed
-from tsdf.walk.geometry import MESH, Place, Triangles, ball_hit, exact_hit, place
+from tsdf.walk.geometry import Place, Triangles, ball_hit, exact_hit, place
 from tsdf.walk.hybrid import ALL, hybrid_notes, singles_of
 from tsdf.walk.leaps import Leaps
 from tsdf.walk.lights import LightArrays, compile_lights
 from tsdf.walk.memory import Memory
 from tsdf.walk.records import memory_of
+from tsdf.walk.room import BALL, BOX, MESH
 from tsdf.walk.transport import NOBODY, CameraArrays
 from tsdf.walk.walker import MAX_EVENTS, UNENDING, Attenuation, Media
 
@@ -61,6 +62,7 @@ BOUNCES = 500  # after which there is none; a hole of a thousandth of all surfac
 SLOW = 1e5  # grains met by a path, beyond which it is said how long that takes
 ENDLESS = 1e7  # beyond which a path takes seconds
 EVENTS_PER_SECOND = 1e7  # of one thread, about
+LATTICE = 16  # places along each side of a box that it looks for
 LOOKS = 200  # pixels along each side through which it is looked whether the camera sees anything
 
 
@@ -132,7 +134,8 @@ def camera_of(world: World) -> CameraArrays:
 
 
 def sees(world: World) -> bool:
-    """Return whether anything of the scene is in the picture, as far as one ray for each of some pixels tells.
+    """Return whether anything of the scene is in the picture, as far as one ray for each of some pixels tells, and some
+    points of each thing.
 
     Raises
     ------
@@ -161,7 +164,22 @@ def sees(world: World) -> bool:
             t, inside, _ = exact_hit(g.kind[m], g.shape[m], camera.origin, d)
             if inside or t < math.inf:
                 return True
-    return False
+    points = _points(place) - camera.origin  # of what is smaller than pixels
+    across, down, ahead = np.linalg.solve(np.stack((camera.right, camera.down, camera.corner), axis=1), points.T)
+    before = ahead > 0.0
+    across, down = across[before] / ahead[before], down[before] / ahead[before]
+    return bool(((across >= 0.0) & (across < width) & (down >= 0.0) & (down < height)).any())
+
+
+def _points(place: Place) -> np.ndarray:
+    """Return points (n, 3) of boundaries and surfaces, or within, some of each."""
+    g = place.arrays
+    meshes = [mesh for mesh in (*place.boundaries, *place.surfaces) if mesh is not None]
+    parts = [mesh.vertices[mesh.faces[:: -(-len(mesh.faces) // LOOKS)]].mean(axis=1) for mesh in meshes]
+    parts += [g.balls[:, :3], g.shape[g.kind == BALL, :3]]
+    lattice = np.stack(np.meshgrid(*[(np.arange(LATTICE) + 0.5) / LATTICE] * 3), axis=-1).reshape(-1, 3)
+    parts += [shape[:3] + lattice * (shape[3:] - shape[:3]) for shape in g.shape[g.kind == BOX]]
+    return np.concatenate([part.reshape(-1, 3) for part in parts])
 
 
 def check_sight(world: World) -> None:

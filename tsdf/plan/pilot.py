@@ -265,7 +265,7 @@ class Pilot:
 
     def regions(self, other: "Pilot") -> tuple[float, float]:
         """Return the mean of the squared difference of regions of the picture to another, of `REGION` pixels that both
-        looked at in each, without noise, over the other's mean [1], and its standard error."""
+        looked at in each, without noise, over the other's mean [1], and its standard error, infinite of one."""
         n = min(len(self.pixels), len(other.pixels))
         both = self.looked[:n] & other.looked[:n]
         camera = self.world.scene.camera
@@ -280,9 +280,11 @@ class Pilot:
             apart = (self.pixel_means(half)[:n] - other.pixel_means(half)[:n])[both] / other.seen.mean
             halves.append(np.stack([np.bincount(which, channel) for channel in apart.T], axis=1) / counts[:, None])
         product = (halves[0] * halves[1]).mean(axis=1)
+        if len(product) < 2:
+            return 0.0, math.inf
         share = counts / counts.sum()
         square = float(share @ product)
-        return square, math.sqrt(float(share**2 @ (product - square) ** 2) * len(product) / max(len(product) - 1, 1))
+        return square, math.sqrt(float(share**2 @ (product - square) ** 2) * len(product) / (len(product) - 1))
 
     def _beside(
         self, other: "Pilot", both: np.ndarray, mean: float, met: float

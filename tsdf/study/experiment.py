@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -19,8 +20,8 @@ from tsdf.handle import Handle
 from tsdf.picture.render import SLOTS, Walkers
 from tsdf.picture.world import World, beam, build
 from tsdf.scene.scene import Absorption, Camera, ConstantLight, GrainSpec, MediumSpec, Render, Scene, Slab, Sphere
-from tsdf.spheres.around import around_of
-from tsdf.spheres.packing import cells_of, pack
+from tsdf.spheres.around import Around, around_of
+from tsdf.spheres.packing import Cells, cells_of, pack
 from tsdf.walk import lanes, transport
 from tsdf.walk import walker as W
 
@@ -46,7 +47,8 @@ class Ends(NamedTuple):
     Attributes
     ----------
     start, place, direction : (n, 3) float64
-        Where each began and ended, relative to the scene's centre, and which way it then went.
+        Where each began and ended, relative to the scene's centre, and which way it then went. Of paths without weight
+        that were walked in lanes, nothing but the first is kept.
     weight : (n,) float64
         What roulette makes of it; throughput but for absorption, 0 if it did not come out.
     amounts : (n, a) float64
@@ -364,13 +366,18 @@ def diffusion(level: str, grain: GrainSpec, fraction: float, paths: int, seed: i
     return Value(float(sums.mean[0]), float(sums.error[0]), sums.event)
 
 
-def _lower(world: World, fraction: float, packing: int, height: float) -> None:
-    """Move the spheres of a packed world down, all the same."""
+@lru_cache(maxsize=32)
+def _lowered(fraction: float, packing: int, height: float) -> tuple[Cells, np.ndarray, Around]:
+    """Return what kernels take of the spheres of a packing, all moved down the same."""
     made = pack(fraction, SPHERES, packing)
     moved = replace(made, centres=(made.centres - (0.0, 0.0, height)) % made.side)
-    world.packed.arrays = world.packed.arrays._replace(
-        cells=(cells_of(moved),), centres=(np.ascontiguousarray(moved.centres),), around=(around_of(moved),)
-    )
+    return cells_of(moved), np.ascontiguousarray(moved.centres), around_of(moved)
+
+
+def _lower(world: World, fraction: float, packing: int, height: float) -> None:
+    """Move the spheres of a packed world down, all the same."""
+    cells, centres, around = _lowered(fraction, packing, height)
+    world.packed.arrays = world.packed.arrays._replace(cells=(cells,), centres=(centres,), around=(around,))
 
 
 def slab_experiment(

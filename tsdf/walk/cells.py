@@ -17,6 +17,7 @@ FINER = (math.sqrt(3.0) - 1.0) / 255.0  # of it: that is at most so much farther
 BLUR = 1e-3  # of that: more than float32 rounds
 HALF_DIAGONAL = math.sqrt(0.75)  # [cells]
 FEW = 3  # facets in a cell, with more of which none is looked at that can be told from the cell alone
+AHEAD = 16  # rows of facets that are fetched before it is known whether a cell has as many
 SIDES = 256  # parts of a cell a side, across the direction of its slab
 LINE = 64  # bytes of a line of a processor's cache
 # A unit vector, between which heights along it all is that is in a cell of its facets, and where in a list they are;
@@ -75,7 +76,7 @@ def listed_of(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return `slabs` and `listed` of a `grid.Grid`: (n, 2) the facets and, a byte each, the lowest and the highest part
     of the cell, of SIDES a side, that they may be in, along the two axes that follow that nearest to the slab's way,
-    where they are more than FEW.
+    where they are more than FEW; and AHEAD more, of nothing.
 
     Parameters
     ----------
@@ -88,8 +89,8 @@ def listed_of(
     """
     slabs, many = lined(len(middles), SLAB), np.diff(first)
     slabs["first"], slabs["last"] = first[:-1], first[1:]
-    both = np.zeros((len(listed), 2), np.int32)
-    both[:, 0] = listed
+    both = np.zeros((len(listed) + AHEAD, 2), np.int32)
+    both[: len(listed), 0] = listed
     off = ROUNDING * float(np.abs(corners).max()) + HAIR * edge
     begins = np.unique(np.searchsorted(first, np.arange(0, len(listed), BATCH), "right") - 1)
     for begin, end in zip(begins, np.append(begins, len(many))[1:], strict=True):

@@ -10,6 +10,7 @@ else they share one ray-engine scene for each exemplar.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,12 +26,13 @@ from tsdf.grain.optics import OFFSET, UNPOLARISED, P, S, fresnel, nearer, on_pla
 from tsdf.sampling import GOLDEN, key_of, mix, unit
 from tsdf.scene.scene import GrainSpec, Scene, called
 from tsdf.spheres.around import ENDLESS, Around, across, around_of, entered, next_around
-from tsdf.spheres.packing import Cells, cells_of, next_sphere, pack
+from tsdf.spheres.packing import Cells, Packing, cells_of, next_sphere, pack
 from tsdf.vectors import KERNEL, dot, renewed, step, triple, unit_of
 from tsdf.walk.geometry import NONE, planes_of
 from tsdf.walk.room import stands
 from tsdf.walk.walker import write
 
+KEPT = 4096  # spheres of a packing, at most, that stays in memory for the next scene
 EXACT_SPHERE = -1
 ENTERED, INSIDE, RETRIED, LEFT = 0, 1, 2, 4
 MOST_SIDES = 64  # of a convex grain that needs no ray engine, which with more is faster
@@ -347,6 +349,12 @@ def mesh_beside(table: Table, folders: Sequence[str | Path]) -> Path | None:
     return next((file for file in files if file.is_file()), None)
 
 
+@lru_cache(maxsize=4)
+def _built_in(name: str, parameters: tuple[tuple[str, Any], ...]) -> Grain:
+    """Return a built-in grain; experiments ask for the same over and over."""
+    return load_grain(name, **dict(parameters))
+
+
 def exemplar(spec: GrainSpec, table: Table, where: str, folder: str | None = None) -> Grain:
     """Return the grain that a table was made of: built in, or from the mesh file that the scene names or, without that,
     the file of its name beside the table, else in the scene's folder.
@@ -361,7 +369,7 @@ def exemplar(spec: GrainSpec, table: Table, where: str, folder: str | None = Non
     mesh = spec.mesh or mesh_beside(table, beside if folder is None else [*beside, folder])
     if mesh is None and built_in(table):
         try:
-            grain = load_grain(header["name"], **dict(header["parameters"]))
+            grain = _built_in(header["name"], tuple(header["parameters"].items()))
         except TSDFError as error:
             raise SceneError(f"{where}: {error}; build the table again") from None
     else:
@@ -383,6 +391,13 @@ def exemplar(spec: GrainSpec, table: Table, where: str, folder: str | None = Non
     return grain
 
 
+@lru_cache(maxsize=8)
+def _laid(fraction: float, spheres: int, seed: int) -> tuple[Packing, tuple[Cells, np.ndarray, Around]]:
+    """Return a packing and what kernels take of it; experiments ask for the same few over and over."""
+    packing = pack(fraction, spheres, seed)
+    return packing, (cells_of(packing), np.ascontiguousarray(packing.centres), around_of(packing))
+
+
 def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed:
     """Pack the media of a scene with the grains of its tables, one table for each component of each medium in turn.
 
@@ -399,7 +414,8 @@ def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed
         exemplar(spec, table, where, scene.folder) if traced else None
         for (spec, where), table in zip(own, tables, strict=True)
     ]
-    cells, centres, around, notes = [], [], [], []
+    laid: list[tuple[Cells, np.ndarray, Around]] = []
+    notes = []
     share, eta, kept_apart, chosen = [], [], [], []
     engines: list[Any] = []
     known: dict[str, int] = {}
@@ -408,12 +424,11 @@ def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed
     facets, at = 0, 0
     for medium, where in zip(scene.media, titles, strict=True):
         try:
-            packing = pack(medium.packing_fraction, medium.packing_spheres, medium.packing_seed)
+            lay = _laid if medium.packing_spheres <= KEPT else _laid.__wrapped__
+            packing, found = lay(medium.packing_fraction, medium.packing_spheres, medium.packing_seed)
         except TSDFError as error:
             raise SceneError(f"{where}: {error}") from None
-        cells.append(cells_of(packing))
-        centres.append(np.ascontiguousarray(packing.centres))
-        around.append(around_of(packing))
+        laid.append(found)
         notes.append(f"{where}: {len(packing.centres)} spheres in a tile of {packing.side:.4g} R, "
                      f"packing fraction {packing.fraction:.6f}")  # fmt: skip
         fractions = np.array([grain.fraction for grain in medium.grains])
@@ -437,9 +452,9 @@ def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed
             chosen.append(known[grain.mesh_hash])
         at += len(fractions)
     arrays = Grains(
-        cells=tuple(cells),
-        centres=tuple(centres),
-        around=tuple(around),
+        cells=tuple(cells for cells, _, _ in laid),
+        centres=tuple(centres for _, centres, _ in laid),
+        around=tuple(around for _, _, around in laid),
         radius=np.array([medium.radius for medium in scene.media]),
         seed=np.array([medium.packing_seed for medium in scene.media], np.uint64),
         share=np.array(share),

@@ -49,8 +49,8 @@ class Lanes(NamedTuple):
     0 on, and from WIDTH on of those that are about to, and room for a shadow's amounts. gone, ready, others (WIDTH,):
     lanes whose walk has ended, and of those that are about to, which do walk and which do not. counts (4,): lanes that
     walk, the next sample, how many are ready, walkers handed over. body: what they walk in, see `sides.body_of`.
-    ends (samples, 10 + a): of those that find light, where they began, where they were last, which way they went from
-    there, weight and amounts; no rows where nobody asks.
+    ends (samples, 10 + a): of those that find light, where they began, where they came out and which way, weight and
+    amounts; no rows where nobody asks.
     """
 
     numbers: np.ndarray
@@ -472,9 +472,10 @@ def settle(world, batch, lanes, i):
         sample = lanes.words[at(SAMPLE, i)]
         give(world, batch, sample, amounts, numbers[at(WEIGHT, i)], light)
         if lanes.ends.shape[0] > 0:
-            own = lanes.ends[sample]
-            own[3], own[4], own[5] = three(numbers, PX, i)
-            own[6], own[7], own[8] = three(numbers, DX, i)
+            own, p, d = lanes.ends[sample], three(numbers, PX, i), three(numbers, DX, i)
+            t = way_out(sides(lanes.body), p, d, d)[0]  # from its last grain, unless a jump has brought it out
+            own[3], own[4], own[5] = step(p, t if 0.0 < t < math.inf else 0.0, d)
+            own[6], own[7], own[8] = d
             own[9] = numbers[at(WEIGHT, i)]
             copy(own[10:], amounts)
     elif state == np.uint64(LOST):

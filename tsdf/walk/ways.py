@@ -12,7 +12,7 @@ import numpy as np
 
 from tsdf.compiled import fetch, njit
 from tsdf.vectors import KERNEL, dot, step, triple
-from tsdf.walk.cells import FEW, PAD, SIDES
+from tsdf.walk.cells import AHEAD, FEW, PAD, SIDES
 from tsdf.walk.grid import BEYOND, GRAZING, NONE, box_in, inverse, line_of, passes
 from tsdf.walk.lanes import STRIDE, at, put, three
 
@@ -191,8 +191,8 @@ def search(grid, ways, near):
     for k in range(near):
         first = grid.slabs[wholes[at(FAR, ways.near[np.uint64(k)])]].first
         fetch(grid.listed[first])
-        fetch(grid.listed[first + 8])
-        fetch(grid.listed[first + 16])
+        fetch(grid.listed[first + AHEAD // 2])
+        fetch(grid.listed[first + AHEAD])
     for k in range(near):
         i = ways.near[np.uint64(k)]
         slab = grid.slabs[np.uint64(wholes[at(FAR, i)])]
