@@ -355,6 +355,7 @@ def test_time_is_kept_on_the_clock(grain: GrainSpec, monkeypatch: pytest.MonkeyP
     assert given[0] == pytest.approx(60.0 * accuracy.BULK / 5)
     assert clock[0] - 1000.0 < 60.0 + 10.0 * max(given)
     assert min(given) < 0.0
+    assert f"it took {clock[0] - 1000.0:.0f} s, for each of so many slabs" in " ".join(found.notes)
 
 
 @pytest.mark.parametrize(

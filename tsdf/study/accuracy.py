@@ -212,6 +212,7 @@ def measure(
         for number, case in enumerate(cases):
             rows += run.case(case, number, len(fractions), len(cases))
         rows += run.times(shown)
+        run.end()
     except KeyboardInterrupt:
         interrupted = True
     there = tuple(level for level in some if any(row.level == level for row in rows))
@@ -297,6 +298,12 @@ class _Run:
         self.began = time.perf_counter()
         if self.seconds is not None:
             self.notes.append(f"{self.seconds:g} s of measuring follow a start of {self.began - began:.1f} s")
+
+    def end(self) -> None:
+        """Say so where it took longer than it was to."""
+        took = time.perf_counter() - self.began
+        if self.seconds is not None and took > 1.1 * self.seconds:
+            self.notes.append(f"it took {took:.0f} s, for each of so many slabs and levels takes the fewest paths")
 
     def time(self, share: float) -> float | None:
         """Return what a share of the time is, less what is overspent already [s]; None where paths are counted."""
