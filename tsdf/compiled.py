@@ -19,7 +19,7 @@ import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -187,19 +187,18 @@ def stamp(name: str) -> str:
 
     How kernels read handles and are compiled is part of all of them.
     """
-    digest = hashlib.sha256()
-    for one in sorted(imported(name) | imported("compiled") | imported("handle")):
-        digest.update(hashlib.sha256(_text(one) or b"").digest())
-    return digest.hexdigest()
+    return _digest(_text(one) or b"" for one in sorted(imported(name) | imported("compiled") | imported("handle")))
 
 
 @cache
 def _whole() -> str:
     """Return the SHA-256 of the text of the package, of which kernels elsewhere may be made."""
-    digest = hashlib.sha256()
-    for file in sorted(PACKAGE.rglob("*.py")):
-        digest.update(hashlib.sha256(file.read_bytes()).digest())
-    return digest.hexdigest()
+    return _digest(file.read_bytes() for file in sorted(PACKAGE.rglob("*.py")))
+
+
+def _digest(texts: Iterable[bytes]) -> str:
+    """Return the SHA-256 of the digests of texts, in hexadecimal."""
+    return hashlib.sha256(b"".join(hashlib.sha256(text).digest() for text in texts)).hexdigest()
 
 
 def private_folder() -> Path | None:

@@ -11,14 +11,13 @@ from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
 from tsdf.handle import Handle
 from tsdf.make.scatterometer import Effort, exact_sphere
-from tsdf.picture import image, render, world
+from tsdf.picture import render, world
 from tsdf.scene.levels import LEVELS
 from tsdf.scene.scene import (
     Absorption,
     Box,
     Camera,
     ConstantLight,
-    EnvironmentLight,
     GrainSpec,
     MediumSpec,
     Mesh,
@@ -34,20 +33,6 @@ SUN = SunLight((0.36, -0.48, 0.8), (3.0, 2.0, 1.0), 2.0)
 OUTSIDE = Camera((3.0, -30.0, 7.0), (0.0, 0.0, 0.0), 20, 15, fov_deg=25.0)
 INSIDE = Camera((0.3, -0.2, 0.1), (1.0, 0.5, 0.3), 16, 12, fov_deg=100.0)
 SAMPLES = 20
-
-
-@pytest.fixture(scope="module")
-def table():
-    """Return the table of the exact sphere."""
-    return exact_sphere(load_grain("sphere"), Optics(1.33), Effort(cells=64, joint=8))
-
-
-@pytest.fixture(scope="module")
-def sky(tmp_path_factory: pytest.TempPathFactory) -> EnvironmentLight:
-    """Return a sky of another radiance in every direction, so even that nothing is aimed at it."""
-    file = tmp_path_factory.mktemp("sky") / "sky.exr"
-    image.write_exr(file, np.random.default_rng(1).uniform(0.5, 1.5, (16, 32, 3)))
-    return EnvironmentLight(file)
 
 
 @pytest.fixture(scope="module")

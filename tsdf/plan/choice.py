@@ -66,9 +66,7 @@ def choose(found: list[Prediction], wish: Wish) -> tuple[Prediction, bool]:
         aimed = aimed or [p for p in found if not wish.unfinished(p)] or found
         least = min(aimed, key=lambda p: p.likely_error(limit))
         if not least.candidate.single and least.texture > wish.target:
-            enough = SWAMPED * least.likely_error(limit)
-            alike = [p for p in aimed if not p.candidate.single and not p.likely_error(limit) > enough]
-            return safest(alike, lambda p: p.error_of_regions(limit)), True
+            return safest(swamped(aimed, limit), lambda p: p.error_of_regions(limit)), True
         enough = TIE * least.likely_error(limit)
         alike = [p for p in aimed if p.likely_error(limit) <= enough] or aimed  # of pilots without light
         return safest(alike, lambda p: math.hypot(p.bias, p.bias_error, p.noise(limit))), False
@@ -76,6 +74,13 @@ def choose(found: list[Prediction], wish: Wish) -> tuple[Prediction, bool]:
         return safest(found, lambda p: p.floor.high), False
     alike = [p for p in found if p.safe_seconds(wish.target) <= TIE * takes]
     return min(alike, key=lambda p: p.floor.high), False
+
+
+def swamped(some: Sequence[Prediction], seconds: float) -> list[Prediction]:
+    """Return those without single grains whose errors of pixels after so long [s] do not tell them apart."""
+    some = [p for p in some if not p.candidate.single]
+    enough = SWAMPED * min((p.likely_error(seconds) for p in some), default=0.0)
+    return [p for p in some if not p.likely_error(seconds) > enough]
 
 
 def safest(some: Sequence[Prediction], error: Callable[[Prediction], float]) -> Prediction:

@@ -158,7 +158,6 @@ class _Planning(Evidence):
         self.packings: dict[bool, Packed] = {}
         self.wide = WIDE  # [deg] of suns in pilots, at least
         self.real = 0.0  # `chance` of the suns of the picture
-        self.regional = False  # whether the choice is by the error of regions
         self.dear = False  # whether single grains cannot be piloted
 
     def plan(self) -> Plan:
@@ -182,7 +181,7 @@ class _Planning(Evidence):
         self.known = 1.0 - CHECK
         self.refer_anew()
         self.weigh()
-        chosen, found = self.settled()
+        chosen, found, regional = self.settled()
         rest = sorted((p for p in found if p is not chosen), key=lambda p: (p.safe_seconds(self.target), p.floor.value))
         far = bool(chosen.candidate.explicit_grains) and self.far
         thin = all(medium.packing_fraction <= MOST_PACKED for medium in self.scene.media)
@@ -194,12 +193,13 @@ class _Planning(Evidence):
             self.asked, self.target, self.limit if self.said or beyond else None, (chosen, *rest), far, (),
             tuple(lacking), tuple(self.notes), self.spent, self.clocks.wall() - self.began, self.compiling,
             self.threads, self.load, self.spp, self.load * self.wish.glints(chosen, rest) if beyond else 0.0,
-            2.0 / max(self.footprint, 1e-6), self.regional, self.places, self.packings,
+            2.0 / max(self.footprint, 1e-6), regional, self.places, self.packings,
         )  # fmt: skip
         return replace(made, why=why(made, self.bodies, self.footprint, self.coverage, str(self.reference)))
 
-    def settled(self) -> tuple[Prediction, list[Prediction]]:
-        """Return what is chosen, which a pilot has seen where one can, and all predictions."""
+    def settled(self) -> tuple[Prediction, list[Prediction], bool]:
+        """Return what is chosen, which a pilot has seen where one can, all predictions, and whether the choice is by
+        the error of regions."""
         for looks in range(MOST_CHECKS):
             one = self.choose(self.predictions()).candidate
             if one in self.pilots or (looks and self.spent > self.ends + BRIEF) or self.stopped():
@@ -214,13 +214,13 @@ class _Planning(Evidence):
         seen = [
             p for p in found if p.candidate in self.pilots or (self.dear and LEVELS[p.candidate.level].traits.packed)
         ]
-        chosen = self.choose(seen or found)
+        chosen, regional = choose(seen or found, self.wish)
         if not self.stopped() and (bold := self.bolder_of(chosen)) is not None and self.add(bold):
             self.round(max(self.ends - self.spent, BRIEF), [chosen.candidate, bold], 0.0)
             found = self.predictions()
             plain, bolder = (next(p for p in found if p.candidate == one) for one in (chosen.candidate, bold))
             chosen = bolder if bolder.safe_seconds(self.target) < plain.safe_seconds(self.target) else plain
-        return chosen, found
+        return chosen, found, regional
 
     def bolder_of(self, chosen: Prediction) -> Candidate | None:
         """Return a candidate with bolder leaps, where they may win and its error would still do: at the level whose
@@ -533,8 +533,7 @@ class _Planning(Evidence):
 
     def choose(self, found: list[Prediction]) -> Prediction:
         """Return what is taken of these."""
-        one, self.regional = choose(found, self.wish)
-        return one
+        return choose(found, self.wish)[0]
 
 
 def loaded(scene: Scene) -> tuple[Scene, list[Table]]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tsdf.plan.choice import SWAMPED
+from tsdf.plan.choice import swamped
 from tsdf.plan.prediction import BLOCK, TIE, UNFINISHED, Plan, Prediction
 from tsdf.plan.prior import Body
 
@@ -198,10 +198,7 @@ def _short_of_time(plan: Plan, able: float) -> str:
     known = [p for p in plan.predictions[1:] if math.isfinite(p.variance)] or plan.predictions[1:]
     done = [p for p in known if not (plan.glints and p.candidate.single and p.noise(able) > UNFINISHED)] or known
     if plan.regional:
-        some = [p for p in done if not p.candidate.single]
-        enough = SWAMPED * min((p.likely_error(able) for p in some), default=0.0)
-        some = [p for p in some if not p.likely_error(able) > enough]
-        second = min(some or done, key=lambda p: p.error_of_regions(able))
+        second = min(swamped(done, able) or done, key=lambda p: p.error_of_regions(able))
         off = percent(second.error_of_regions(able))
         runner = f"runner-up: {second.candidate}, an error of {percent(second.error(able))}, of such means {off}"
     else:

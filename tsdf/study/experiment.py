@@ -20,10 +20,11 @@ from tsdf.handle import Handle
 from tsdf.picture.render import SLOTS, Walkers
 from tsdf.picture.world import World, beam, build
 from tsdf.scene.scene import Absorption, Camera, ConstantLight, GrainSpec, MediumSpec, Render, Scene, Slab, Sphere
-from tsdf.spheres.around import Around, around_of
-from tsdf.spheres.packing import Cells, cells_of, pack
+from tsdf.spheres.around import Around
+from tsdf.spheres.packing import Cells, pack
 from tsdf.walk import lanes, transport
 from tsdf.walk import walker as W
+from tsdf.walk.explicit import laid
 
 WIDE = 300.0  # [R] width of beams, so that they see many places of a packing
 FAR = 1e6  # [R] radius of what stands for an endless medium
@@ -136,8 +137,13 @@ def trips(
             mine.walkers[0][live : live + more] = those[again]
             mine.amounts[0][live : live + more] = mine.amounts[1][gone][again]
             live += more
-    events, seconds = int(mine.counters[W.EVENTS]), time.thread_time() - began
-    return events, events - int(mine.counters[W.LEAPT]) + int(mine.counters[W.LEAPS]), seconds
+    return _spent(mine, began)
+
+
+def _spent(mine: Walkers, began: float) -> tuple[int, int, float]:
+    """Return the grains that walkers have met, what was drawn for that, and their thread's time since it began."""
+    events = int(mine.counters[W.EVENTS])
+    return events, events - int(mine.counters[W.LEAPT]) + int(mine.counters[W.LEAPS]), time.thread_time() - began
 
 
 def _batch(
@@ -185,11 +191,9 @@ def _abreast(
             ends[~those["sample"], 3:] = np.column_stack(
                 (those["p"], those["d"], those["weight"], mine.amounts[1][gone])
             )
-    counters = mine.counters
-    met, seconds = int(counters[W.EVENTS]), time.thread_time() - began
-    drawn = met - int(counters[W.LEAPT]) + int(counters[W.LEAPS])
+    spent = _spent(mine, began)
     start, place, way, weight, amounts = np.split(ends, (3, 6, 9, 10), axis=1)
-    return place[:, None], Ends(start, place, way, weight[:, 0], amounts, met, drawn, seconds)
+    return place[:, None], Ends(start, place, way, weight[:, 0], amounts, *spent)
 
 
 def follow(
@@ -370,8 +374,7 @@ def diffusion(level: str, grain: GrainSpec, fraction: float, paths: int, seed: i
 def _lowered(fraction: float, packing: int, height: float) -> tuple[Cells, np.ndarray, Around]:
     """Return what kernels take of the spheres of a packing, all moved down the same."""
     made = pack(fraction, SPHERES, packing)
-    moved = replace(made, centres=(made.centres - (0.0, 0.0, height)) % made.side)
-    return cells_of(moved), np.ascontiguousarray(moved.centres), around_of(moved)
+    return laid(replace(made, centres=(made.centres - (0.0, 0.0, height)) % made.side))
 
 
 def _lower(world: World, fraction: float, packing: int, height: float) -> None:

@@ -391,11 +391,16 @@ def exemplar(spec: GrainSpec, table: Table, where: str, folder: str | None = Non
     return grain
 
 
+def laid(packing: Packing) -> tuple[Cells, np.ndarray, Around]:
+    """Return what kernels take of a packing: `cells`, `centres` and `around` of `Grains`."""
+    return cells_of(packing), np.ascontiguousarray(packing.centres), around_of(packing)
+
+
 @lru_cache(maxsize=8)
-def _laid(fraction: float, spheres: int, seed: int) -> tuple[Packing, tuple[Cells, np.ndarray, Around]]:
+def _packing(fraction: float, spheres: int, seed: int) -> tuple[Packing, tuple[Cells, np.ndarray, Around]]:
     """Return a packing and what kernels take of it; experiments ask for the same few over and over."""
     packing = pack(fraction, spheres, seed)
-    return packing, (cells_of(packing), np.ascontiguousarray(packing.centres), around_of(packing))
+    return packing, laid(packing)
 
 
 def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed:
@@ -414,7 +419,7 @@ def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed
         exemplar(spec, table, where, scene.folder) if traced else None
         for (spec, where), table in zip(own, tables, strict=True)
     ]
-    laid: list[tuple[Cells, np.ndarray, Around]] = []
+    spheres: list[tuple[Cells, np.ndarray, Around]] = []
     notes = []
     share, eta, kept_apart, chosen = [], [], [], []
     engines: list[Any] = []
@@ -424,11 +429,11 @@ def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed
     facets, at = 0, 0
     for medium, where in zip(scene.media, titles, strict=True):
         try:
-            lay = _laid if medium.packing_spheres <= KEPT else _laid.__wrapped__
-            packing, found = lay(medium.packing_fraction, medium.packing_spheres, medium.packing_seed)
+            made = _packing if medium.packing_spheres <= KEPT else _packing.__wrapped__
+            packing, found = made(medium.packing_fraction, medium.packing_spheres, medium.packing_seed)
         except TSDFError as error:
             raise SceneError(f"{where}: {error}") from None
-        laid.append(found)
+        spheres.append(found)
         notes.append(f"{where}: {len(packing.centres)} spheres in a tile of {packing.side:.4g} R, "
                      f"packing fraction {packing.fraction:.6f}")  # fmt: skip
         fractions = np.array([grain.fraction for grain in medium.grains])
@@ -452,9 +457,9 @@ def packed(scene: Scene, tables: Sequence[Table], traced: bool = True) -> Packed
             chosen.append(known[grain.mesh_hash])
         at += len(fractions)
     arrays = Grains(
-        cells=tuple(cells for cells, _, _ in laid),
-        centres=tuple(centres for _, centres, _ in laid),
-        around=tuple(around for _, _, around in laid),
+        cells=tuple(cells for cells, _, _ in spheres),
+        centres=tuple(centres for _, centres, _ in spheres),
+        around=tuple(around for _, _, around in spheres),
         radius=np.array([medium.radius for medium in scene.media]),
         seed=np.array([medium.packing_seed for medium in scene.media], np.uint64),
         share=np.array(share),
