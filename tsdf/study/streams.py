@@ -81,7 +81,7 @@ def two_streams(depth: np.ndarray, albedo: np.ndarray, g: np.ndarray, cosine: fl
             - 2.0 * k * (y4 + a1 * cosine) * ek
         )
     )
-    return Streams(np.clip(reflected, 0.0, 1.0), np.clip(beam - passed, 0.0, 1.0))
+    return Streams(np.clip(reflected, 0.0, 1.0), np.where(np.isinf(depth), 0.0, np.clip(beam - passed, 0.0, 1.0)))
 
 
 def asymptotic(depth: np.ndarray, coalbedo: np.ndarray, g: np.ndarray, cosine: float | None) -> Streams:
@@ -105,7 +105,8 @@ def asymptotic(depth: np.ndarray, coalbedo: np.ndarray, g: np.ndarray, cosine: f
     with np.errstate(over="ignore"):
         through = np.where(y < DEEPEST, np.sinh(np.minimum(y, DEEPEST)) / np.sinh(ALPHA * y + x), 0.0)
     reflected = np.exp(-y * escape) - escape * through * np.exp(-x - y)
-    return Streams(np.clip(reflected, 0.0, 1.0), np.clip(escape * through, 0.0, 1.0))
+    passed = np.where(np.isinf(depth), 0.0, np.clip(escape * through, 0.0, 1.0))
+    return Streams(np.clip(reflected, 0.0, 1.0), passed)
 
 
 def doubled(depth: np.ndarray, albedo: np.ndarray, moments: np.ndarray, cosine: float | None) -> Streams:
