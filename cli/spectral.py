@@ -59,8 +59,9 @@ def options(command: Command) -> Command:
         (
             click.argument("grains", nargs=-1, required=True, metavar="GRAIN|TABLE.."),
             click.option("--material", metavar="NAME|FILE",
-                         help="As of tsdf-build: ice, water, quartz, salt, glass, sucrose, or your own constants.  "
-                         "[default: that of the TABLE, else ice]"),
+                         help="As of tsdf-build: ice, water, quartz, salt, glass, sucrose, or your own constants, of "
+                         "which log k is linear between rows, but k next to a row of 0.  [default: that of the TABLE, "
+                         "else ice]"),
             click.option("--wavelength-nm", default="300:2500:10", show_default=True, metavar="FROM:TO:STEP|A,B,..",
                          help="Wavelengths [nm], ends included."),
             click.option("--radius", callback=metres, metavar="LENGTH", help="Bounding radius R, 0.5mm say."),

@@ -145,6 +145,9 @@ def test_tables_that_make_no_family(ice: Constants) -> None:
     build.run(cube)
     with pytest.raises(UsageError, match="different grains"):
         Family.of([*ball, build.table()])
+    apart = scatterometer.exact_sphere(load_grain("sphere"), Optics(1.32, "sp"), Effort())
+    with pytest.raises(UsageError, match="--fresnel sp and --fresnel un"):
+        Family.of([*ball, apart])
     with pytest.raises(UsageError, match="the same index"):
         Family.of([ball[0], ball[0]])
     with pytest.raises(UsageError, match="add tables at the ends"):

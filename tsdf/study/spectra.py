@@ -119,7 +119,7 @@ class Family:
     Raises
     ------
     UsageError
-        If they are of several grains, or two of them have the same index.
+        If they are of several grains or conventions of Fresnel, or two of them have the same index.
     """
 
     tables: tuple[Table, ...]
@@ -131,6 +131,8 @@ class Family:
 
         if any(shape(table) != shape(self.tables[0]) for table in self.tables):
             raise UsageError("the tables are of different grains: give tables of one grain at several indices")
+        if len({str(table.header["optics"]["fresnel"]) for table in self.tables}) > 1:
+            raise UsageError("the tables are made with --fresnel sp and --fresnel un: give tables of one of them")
         if (np.diff(self.eta) <= SAME).any():
             raise UsageError("two of the tables have the same index: give each once")
 
