@@ -86,6 +86,7 @@ def main(  # noqa: PLR0913 - an argument for each option
         raise UsageError(f"--packing is above 0 and at most {MAX_PACKING_FRACTION:g}, not {packing:g}")
     if density is not None and not 0.0 < density < math.inf:
         raise UsageError(f"--density is a finite number > 0, not {density:g}")
+    asked.need_density(*(["density"] if density is not None else []))
     with working(quiet) as work:
         records = {"memory": {"memory": 64}, "joint": {"joint": 32}}
         needed = slabs.records_of(level)
@@ -113,7 +114,8 @@ def main(  # noqa: PLR0913 - an argument for each option
     title = f"{body} of {name}, {c.material}, {size}, packing fraction {packing:.4g}{over}, {light}, level {level}"
     notes = [
         title,
-        f"{result.paths} paths at n = {', '.join(f'{eta:.5g}' for eta in result.eta)}; constants: {c.source}",
+        f"{result.paths} paths at n = {', '.join(f'{eta:.5g}' for eta in result.eta)}; {spectral.tables_of(family)}; "
+        f"constants: {c.source}",
         *found.notes,
     ]
     notes = [plain(note) for note in notes]
@@ -123,6 +125,7 @@ def main(  # noqa: PLR0913 - an argument for each option
         plots.save(spectral_plots.plot_albedo(result, c.wavelength_nm, title), plot)
     facts = {
         "grain": name, "material": c.material, "source": c.source, "radius_m": radius, "size": size, "level": level,
+        "material_density": words.sizes.material_density, "fresnel": family.tables[0].header["optics"]["fresnel"],
         "packing_fraction": packing, "thickness_m": thickness, "angle_deg": angle, "ground": ground,
         "paths": result.paths, "eta": result.eta.tolist(), "profile_edges_m": (radius * result.edges).tolist(),
     }  # fmt: skip

@@ -66,7 +66,7 @@ def main(
     )
     notes = [
         f"single scattering of {family.tables[0].header['grain']['name']}, {c.material} ({c.source}), {size}",
-        f"tables at n = {', '.join(f'{eta:.5g}' for eta in family.eta)}{missed}",
+        f"{spectral.tables_of(family)}{missed}",
         *found.notes,
     ]
     notes = [plain(note) for note in notes]
@@ -87,5 +87,6 @@ def main(
     facts = {
         "grain": family.tables[0].header["grain"]["name"], "material": c.material, "source": c.source,
         "radius_m": found.radius, "size": size, "table_eta": family.eta.tolist(),
+        "fresnel": family.tables[0].header["optics"]["fresnel"], "material_density": words.sizes.material_density,
     }  # fmt: skip
     spectral.tell(spectra.columns(found), facts, notes, as_json, csv_file, quiet)

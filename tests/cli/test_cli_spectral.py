@@ -87,6 +87,10 @@ def test_albedo_says_what_was_asked(tmp_path: Path) -> None:
         ((CUBE, "--ssa", -1), 2, "ssa"),
         ((CUBE, "--plot", "x.gif"), 2, "a .png, .pdf or .svg"),
         ((CUBE, "--csv", CUBE), 2, "it is an input"),
+        ((CUBE, "--fresnel", "un"), 2, "--fresnel is that of tables that are made"),
+        (("cube", "--fresnel", "sp"), 2, "use --fresnel un for meshes"),
+        (("sphere", "--material-density", 0), 2, "--material-density is a finite number > 0, not 0"),
+        (("sphere", "--material", "mine.csv", "--ssa", 20), 2, "not known of mine.csv: say --material-density"),
         (("no-such.tsdf.exr",), 1, "no-such.tsdf.exr"),
         (("no-such-grain",), 1, "neither a file nor a built-in grain"),
     ],
@@ -123,6 +127,39 @@ def test_what_is_wrong_is_said_before_tables_are_made() -> None:
     for arguments in (("--packing", 0.9), ("--ground", 2, "--thickness", "1mm"), ("--profile", -1), ("--paths", 1)):
         result = run(albedo, "snow", "--table-paths", "1e18", *arguments)
         assert result.exit_code == 2 and result.output.count("\n") == 1, result.output
+
+
+@pytest.mark.slow
+def test_constants_of_your_own_take_a_density(tmp_path: Path) -> None:
+    """Grains of an SSA are as large as the density says, and as those of ice if it is that of ice."""
+    mine = tmp_path / "mine.csv"
+    mine.write_text("wavelength_nm,n,k\n500,1.31,1e-7\n1000,1.31,1e-7\n")
+    same = ("sphere", "--wavelength-nm", "600", "--json")
+
+    def radius(*words: object) -> float:
+        result = run(optics, *same, "--ssa", 20, *words)
+        assert result.exit_code == 0, result.output
+        return float(json.loads(result.stdout)["radius_m"])
+
+    assert radius("--material", mine, "--material-density", 500) == pytest.approx(3.0 / (500.0 * 20.0))
+    assert radius("--material", mine, "--material-density", 917) == pytest.approx(radius()) == 3.0 / (917.0 * 20.0)
+    thin = ("--material", mine, "--thickness", "1mm", "--paths", 64, *same)
+    without = run(albedo, *thin, "--density", 300)
+    assert without.exit_code == 2 and "--density needs the density of the material" in without.stderr
+    slab = json.loads(run(albedo, *thin, "--density", 300, "--material-density", 1000).stdout)
+    assert slab["packing_fraction"] == pytest.approx(0.3) and slab["material_density"] == 1000.0
+
+
+@pytest.mark.slow
+def test_the_convention_of_fresnel_is_said() -> None:
+    """Kept apart g of a sphere is the exact one of polarised light, averaged it is not, and the notes say which."""
+    from tsdf.judge.analytic import sphere_statistics
+
+    for words, convention in (((), "un"), (("--fresnel", "sp"), "sp")):
+        facts = json.loads(run(optics, "sphere", "--wavelength-nm", "500", "--json", *words).stdout)
+        exact = sphere_statistics(facts["n"][0], convention, 0.0).mean_cosine
+        assert facts["fresnel"] == convention and facts["g"][0] == pytest.approx(exact, abs=1e-5)
+        assert f"Fresnel {convention} (" in " ".join(facts["notes"])
 
 
 def test_near_wavelengths_keep_their_columns(tmp_path: Path) -> None:
