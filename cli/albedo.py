@@ -1,8 +1,9 @@
 """``tsdf-albedo``: grains in a slab or a half-space, spectral albedo out."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
@@ -10,6 +11,9 @@ from click.core import ParameterSource
 from tsdf.cli import spectral
 from tsdf.cli.common import Tool, check_numbers, named_levels, plain, seed_option, whole_number, working
 from tsdf.errors import UsageError
+
+if TYPE_CHECKING:
+    from tsdf.scene.sizes import InWords
 
 COMMANDLINE = ParameterSource.COMMANDLINE
 
@@ -77,6 +81,7 @@ def main(  # noqa: PLR0913 - an argument for each option
         check_suffix(plot)
 
     from tsdf.scene.medium import MAX_PACKING_FRACTION
+    from tsdf.scene.sizes import DENSEST_RANDOM
     from tsdf.study import slabs, spectra
 
     # before tables are made, which takes minutes
@@ -95,27 +100,34 @@ def main(  # noqa: PLR0913 - an argument for each option
             c, lambda share, word: work.progress(0.3 * share, word), seed, **records.get(needed or "", {})
         )
         words = asked.words(family, **({"packing_fraction": packing} if density is None else {"density": density}))
-        assert words.packing_fraction is not None
-        packing, radius = words.packing_fraction, words.radius
+        packing, radius = words.fraction, words.radius
+        crammed = _crammed(words, level, density, thickness, depth)
+        if crammed > 1.0:
+            packing = DENSEST_RANDOM
         found = spectra.spectrum(family, c, radius)
         request = slabs.Request(
-            level, packing, math.inf if thickness is None else thickness / radius,
+            level, packing, math.inf if thickness is None else crammed * thickness / radius,
             None if angle is None else math.cos(math.radians(angle)), ground, profile,
-            100.0 if depth is None else depth / radius, mesh if mesh is not None else asked.mesh,
+            100.0 if depth is None else crammed * depth / radius, mesh if mesh is not None else asked.mesh,
         )  # fmt: skip
         result = slabs.measure(
             family, found, request, error, seed, asked.threads, paths,
             lambda share, word: work.progress(0.3 + 0.7 * share, word),
         )  # fmt: skip
+    result = replace(result, edges=result.edges / crammed)
     name, size = family.tables[0].header["grain"]["name"], asked.told(words)
     body = "half-space" if thickness is None else f"slab of {thickness:g} m"
     light = "diffuse light" if angle is None else f"light at {angle:g} degrees"
     over = f" over ground of reflectance {ground:g}" if ground else ""
-    title = f"{body} of {name}, {c.material}, {size}, packing fraction {packing:.4g}{over}, {light}, level {level}"
+    dense = "" if density is None else f"density {density:g} kg/m3, "
+    title = (
+        f"{body} of {name}, {c.material}, {size}, {dense}packing fraction {packing:.4g}{over}, {light}, level {level}"
+    )
     notes = [
         title,
         f"{result.paths} paths at n = {', '.join(f'{eta:.5g}' for eta in result.eta)}; {spectral.tables_of(family)}; "
         f"constants: {c.source}",
+        *([_as_much_mass(words, crammed, thickness)] if crammed > 1.0 else []),
         *found.notes,
     ]
     notes = [plain(note) for note in notes]
@@ -126,7 +138,50 @@ def main(  # noqa: PLR0913 - an argument for each option
     facts = {
         "grain": name, "material": c.material, "source": c.source, "radius_m": radius, "size": size, "level": level,
         "material_density": words.sizes.material_density, "fresnel": family.tables[0].header["optics"]["fresnel"],
-        "packing_fraction": packing, "thickness_m": thickness, "angle_deg": angle, "ground": ground,
+        "density": words.density, "packing_fraction": packing, "thickness_m": thickness, "angle_deg": angle,
+        "ground": ground,
         "paths": result.paths, "eta": result.eta.tolist(), "profile_edges_m": (radius * result.edges).tolist(),
     }  # fmt: skip
     spectral.tell(slabs.columns(result, found), facts, notes, as_json, csv_file, quiet)
+
+
+def _crammed(
+    words: "InWords", level: str, density: float | None, thickness: float | None, depth: float | None
+) -> float:
+    """Return how many times more mass there is in a volume than where bounding spheres are packed as densely as they
+    can; 1 where there is room for them.
+
+    Grains that are points need no room: light meets the same grains in a slab that much thicker.
+
+    Raises
+    ------
+    UsageError
+        At levels whose grains need room.
+    """
+    from tsdf.scene.levels import LEVELS
+    from tsdf.scene.sizes import DENSEST_RANDOM, unpackable
+
+    crammed = words.fraction / DENSEST_RANDOM
+    if density is None or crammed <= 1.0:
+        return 1.0
+    if LEVELS[level].traits.spheres:
+        lengths = (("--thickness", thickness), ("--depth", depth))
+        same = [f"{option} {1e3 * crammed * length:.3g}mm" for option, length in lengths if length is not None]
+        kept = "as much mass per area" if same else "of a half-space density hardly matters"
+        raise UsageError(
+            f"{unpackable(words.sizes, 'density', density, words.fraction)}. At level {level} keep the size of grains "
+            f"and say {' '.join([f'--packing {DENSEST_RANDOM:g}', *same])}: {kept}; or take --level volume, whose "
+            "grains need no room"
+        )
+    return crammed
+
+
+def _as_much_mass(words: "InWords", crammed: float, thickness: float | None) -> str:
+    """Return the note on grains that are denser than their bounding spheres can be packed."""
+    from tsdf.scene.sizes import DENSEST_RANDOM
+
+    body = "of a half-space" if thickness is None else f"in a slab of {1e3 * crammed * thickness:.4g} mm"
+    return (
+        f"{words.density:.4g} kg/m3 would take a packing fraction of {words.fraction:.3g}: free paths are those of "
+        f"{DENSEST_RANDOM:g}, {(words.density or 0.0) / crammed:.3g} kg/m3, {body}, which has the same mass per area"
+    )

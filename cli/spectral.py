@@ -235,7 +235,7 @@ class Asked(NamedTuple):
         return is_table(self.grains[0])
 
     def words(self, family: "Family", **amount: float) -> "InWords":
-        """Return sizes in metres, and how much of space is filled where that is said.
+        """Return sizes in metres, and how much of space is filled where that is said, with or without room for spheres.
 
         Raises
         ------
@@ -245,7 +245,7 @@ class Asked(NamedTuple):
 
         said = dict(self.sizes) | self.solid | amount
         try:
-            return convert([(family.tables[0], 1.0)], said, 1.0, amount_needed=bool(amount))
+            return convert([(family.tables[0], 1.0)], said, 1.0, amount_needed=bool(amount), packed=False)
         except UsageError as error:
             raise UsageError(by_option(error)) from None
 

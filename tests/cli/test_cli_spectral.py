@@ -107,7 +107,9 @@ def test_what_both_refuse(command: object, arguments: tuple[object, ...], status
         (("--angle", 90), "below 90"), (("--angle", 30, "--diffuse"), "give one"), (("--ground", 0.5), "--thickness"),
         (("--ground", 1.5, "--thickness", "1mm"), "0 to 1"), (("--level", "telport"), "did you mean teleport"),
         (("--error", 0), "--error"), (("--depth", "1mm"), "--profile"), (("--paths", 0), "at least 1"),
-        (("--density", 900), "Say --packing 0.64"), (("--packing", 0.9), "0.74"),
+        (("--density", 900, "--level", "teleport"), "--packing 0.64: of a half-space density hardly matters"),
+        (("--density", 470.776, "--level", "teleport", "--thickness", "1mm"), "--packing 0.64 --thickness 2.18mm: as"),
+        (("--density", 918), "or another --material-density"), (("--packing", 0.9), "0.74"),
         (("--material", "quartz"), "not known at 300 nm"),
         (("--level", "teleport-joint"), "--joint 32"), (("--profile", 2000), "1 to 1000"),
         (("--packing", 0.5, "--density", 100), "--packing and --density"),
@@ -160,6 +162,27 @@ def test_the_convention_of_fresnel_is_said() -> None:
         exact = sphere_statistics(facts["n"][0], convention, 0.0).mean_cosine
         assert facts["fresnel"] == convention and facts["g"][0] == pytest.approx(exact, abs=1e-5)
         assert f"Fresnel {convention} (" in " ".join(facts["notes"])
+
+
+@pytest.mark.slow
+def test_points_need_no_room() -> None:
+    """A density at which bounding spheres cannot be packed is as much mass of the same grains at the densest packing,
+    in a slab that is thicker; depths are those of the slab that was asked for. Half as thick it is another."""
+    cube = tsdf.read(CUBE)
+    most = 0.64 * cube.header["grain"]["volume"] / (4.0 / 3.0 * np.pi) * 917.0
+
+    def slab(*words: object) -> dict:
+        words = (CUBE, *SOME, "--ssa", 20, "--profile", 2, "--paths", 512, "--json", *words)
+        return json.loads(run(albedo, *words).stdout)
+
+    dense = slab("--density", 1.6 * most, "--thickness", "2mm")
+    same, other = (slab("--packing", 0.64, "--thickness", f"{t}mm") for t in (3.2, 2.0))
+    assert dense["packing_fraction"] == 0.64 and dense["density"] == pytest.approx(1.6 * most)
+    assert any("in a slab of 3.2 mm, which has the same mass per area" in note for note in dense["notes"])
+    for name in ("reflectance", "transmittance", "absorbed_2", "two_streams_r"):
+        assert dense[name] == pytest.approx(same[name], rel=1e-6)
+        assert dense[name] != pytest.approx(other[name], rel=0.01)
+    assert dense["profile_edges_m"] == pytest.approx([0.0, 1e-3, 2e-3])
 
 
 def test_near_wavelengths_keep_their_columns(tmp_path: Path) -> None:
