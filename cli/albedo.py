@@ -74,7 +74,7 @@ def main(  # noqa: PLR0913 - an argument for each option
         raise UsageError("--ground lies below a slab: say its --thickness")
     if depth is not None and (thickness is not None or not profile):
         raise UsageError("--depth is that of the --profile of a half-space; that of a slab goes all through it")
-    spectral.check(asked, csv_file, plot)
+    spectral.check(asked, as_json, csv=csv_file, plot=plot)
     if plot is not None:
         from tsdf.study.plots import check_suffix
 
@@ -142,7 +142,7 @@ def main(  # noqa: PLR0913 - an argument for each option
         "ground": ground,
         "paths": result.paths, "eta": result.eta.tolist(), "profile_edges_m": (radius * result.edges).tolist(),
     }  # fmt: skip
-    spectral.tell(slabs.columns(result, found), facts, notes, as_json, csv_file, quiet)
+    spectral.tell(slabs.columns(result, found), facts, notes, as_json, csv_file, quiet or spectral.is_printed(csv_file))
 
 
 def _crammed(

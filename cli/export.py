@@ -130,7 +130,7 @@ def main(  # noqa: PLR0913 - an argument for each option
     if to == "npz" and out is None:
         raise UsageError("npz is no text: say with --out where to write it")
     if out is not None:
-        check_output(Path(out), Path(file))
+        check_output(Path(out), Path(file), printed="" if to == "npz" else "leave it out")
 
     from tsdf.data import format as tsdf_format
     from tsdf.loaders import export

@@ -70,7 +70,7 @@ def export(files: tuple[str, ...], to: str, said: Said) -> None:
     elif said.absorption is not None:
         raise UsageError("--absorption is for one table and no wavelengths; say --material instead")
     if said.out is not None:
-        check_output(Path(said.out), *asked.inputs)
+        check_output(Path(said.out), *asked.inputs, printed="" if to in FILES else "leave it out")
 
     from tsdf.loaders import radiative
     from tsdf.study import spectra

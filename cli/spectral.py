@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from tsdf.cli.common import check_output, plain, say, setting, threads_option, whole_number
+from tsdf.cli.common import (
+    Output,
+    check_outputs,
+    plain,
+    say,
+    setting,
+    threads_option,
+    whole_number,
+    write_text,
+)
 from tsdf.cli.sizes import by_option, measured
 from tsdf.cli.sizes import said as numbers
 from tsdf.errors import UsageError
@@ -80,7 +89,8 @@ def options(command: Command) -> Command:
                          help="Of the solid [kg/m3].  [default: that of the --material, else of the TABLE's own]"),
             building,
             click.option("--json", "as_json", is_flag=True, help="Print one JSON object."),
-            click.option("--csv", "csv_file", type=click.Path(path_type=Path), metavar="PATH", help="Write columns."),
+            click.option("--csv", "csv_file", type=click.Path(path_type=Path), metavar="PATH",
+                         help="Write columns; - prints them."),
             click.option("--plot", type=click.Path(path_type=Path), metavar="PATH", help="Chart, .png, .pdf or .svg."),
             click.option("--quiet", is_flag=True, help="No progress bar, no table."),
         )
@@ -264,11 +274,28 @@ def tables_of(family: "Family") -> str:
     return f"tables at n = {etas}, Fresnel {convention} ({FRESNEL.get(convention, convention)})"
 
 
-def check(asked: Asked, *outputs: Path | None) -> None:
-    """Refuse outputs that cannot be written, and pictures of no known kind, before any work is done."""
-    written = [path for path in outputs if path is not None]
-    if written:
-        check_output(written[0], *asked.inputs, beside=written[1:])
+def check(asked: Asked, as_json: bool, **outputs: Path | None) -> None:
+    """Refuse outputs that cannot be written, by the names of their options, before any work is done; texts may go to
+    standard output as `-`, one of them."""
+    given = [Output(f"--{name}", path, "" if name == "plot" else "- to print it") for name, path in outputs.items()
+             if path is not None]  # fmt: skip
+    printed = [f"{output.option} -" for output in given if is_printed(output.path)] + ["--json"] * as_json
+    if len(printed) > 1:
+        raise UsageError(f"{' and '.join(printed)} both go to standard output: give one, and the others files")
+    check_outputs([output for output in given if not is_printed(output.path)], *asked.inputs)
+
+
+def is_printed(path: Path | None) -> bool:
+    """Whether an output is to go to standard output."""
+    return path == Path("-")
+
+
+def write(path: Path | None, text: Callable[[], str]) -> None:
+    """Write a text where that is asked for, or print it."""
+    if is_printed(path):
+        click.echo(text(), nl=False)
+    elif path is not None:
+        write_text(path, text())
 
 
 Columns = Mapping[str, "np.ndarray"]
@@ -304,12 +331,8 @@ def text_table(columns: Columns, notes: Sequence[str]) -> str:
 def tell(
     columns: Columns, facts: Mapping[str, Any], notes: Sequence[str], as_json: bool, csv_file: Path | None, quiet: bool
 ) -> None:
-    """Print columns as JSON or for people, and write them as CSV where that is asked for."""
-    from tsdf.files import replacing
-
-    if csv_file is not None:
-        with replacing(csv_file) as temporary:
-            temporary.write_text(csv_text(columns, notes), encoding="utf-8")
+    """Print columns as JSON or for people, and write them as CSV where that is asked for; with `quiet` print none."""
+    write(csv_file, lambda: csv_text(columns, notes))
     if as_json:
         values = {name: [number(value) for value in column] for name, column in columns.items()}
         click.echo(json.dumps({**facts, "notes": list(notes), **values}))

@@ -91,6 +91,10 @@ def test_albedo_says_what_was_asked(tmp_path: Path) -> None:
         (("cube", "--fresnel", "sp"), 2, "use --fresnel un for meshes"),
         (("sphere", "--material-density", 0), 2, "--material-density is a finite number > 0, not 0"),
         (("sphere", "--material", "mine.csv", "--ssa", 20), 2, "not known of mine.csv: say --material-density"),
+        (("sphere", "--csv", "/dev/stdout"), 1, "give --csv the name of a file, or - to print it"),
+        (("sphere", "--plot", "/dev/x.png"), 1, "(screen, pipe or device); give --plot the name of a file\n"),
+        (("sphere", "--csv", "none/x.csv"), 1, "choose another --csv"),
+        (("sphere", "--csv", "-", "--json"), 2, "--csv - and --json both go to standard output"),
         (("no-such.tsdf.exr",), 1, "no-such.tsdf.exr"),
         (("no-such-grain",), 1, "neither a file nor a built-in grain"),
     ],
@@ -183,6 +187,16 @@ def test_points_need_no_room() -> None:
         assert dense[name] == pytest.approx(same[name], rel=1e-6)
         assert dense[name] != pytest.approx(other[name], rel=0.01)
     assert dense["profile_edges_m"] == pytest.approx([0.0, 1e-3, 2e-3])
+
+
+def test_texts_go_to_standard_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As `-`, which is no file then, and alone there: what a file would hold."""
+    monkeypatch.chdir(tmp_path)
+    some = (optics, CUBE, "--wavelength-nm", "500,600", "--orders", 3)
+    for option in ("--csv", "--phase", "--moments"):
+        printed, filed = run(*some, option, "-"), run(*some, option, "file", "--quiet")
+        assert printed.exit_code == filed.exit_code == 0 and filed.stdout == ""
+        assert printed.stdout == (tmp_path / "file").read_text() and [*tmp_path.iterdir()] == [tmp_path / "file"]
 
 
 def test_near_wavelengths_keep_their_columns(tmp_path: Path) -> None:
