@@ -70,7 +70,7 @@ def main(
     ]
     notes = [plain(note) for note in notes]
     if phase is not None:
-        edges, masses = family.masses(c.n, np.nan_to_num(found.absorption_times_radius))
+        edges, masses = family.masses(found)
         spectral.write(phase, lambda: phase_text(edges, masses, spectra.wavelength_heads(c), notes[:1]))
     if moments is not None:
         left, straight = parted(*spectra.moments_of(family, found, orders), forward)
