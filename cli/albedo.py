@@ -10,6 +10,7 @@ from click.core import ParameterSource
 
 from tsdf.cli import spectral
 from tsdf.cli.common import Tool, check_numbers, named_levels, plain, seed_option, whole_number, working
+from tsdf.cli.start import interrupt_status
 from tsdf.errors import UsageError
 
 if TYPE_CHECKING:
@@ -50,13 +51,13 @@ def main(  # noqa: PLR0913 - an argument for each option
     grains: tuple[str, ...], as_json: bool, csv_file: Path | None, plot: Path | None, quiet: bool, level: str,
     packing: float, density: float | None, thickness: float | None, angle: float | None, diffuse: bool, ground: float,
     profile: int, depth: float | None, error: float, paths: int | None, mesh: Path | None, seed: int, **said: Any,
-) -> None:  # fmt: skip
+) -> int:  # fmt: skip
     """Tell what a slab or half-space of GRAIN does to light by wavelength: reflectance, transmittance, absorption.
 
     GRAIN is as of tsdf-build, or tables of one grain at several indices. All wavelengths are read off the same paths,
     followed at up to three refractive indices. Beside them, from the same single scattering: doubling, which is level
     volume without noise, two streams (delta-Eddington) and asymptotic theory. `between` is what n between the indices
-    may miss.
+    may miss. An interrupt keeps what the paths so far have told.
     """
     asked = spectral.Asked.of(grains, said)
     check_numbers(seed, said["threads"], paths=paths)
@@ -94,6 +95,11 @@ def main(  # noqa: PLR0913 - an argument for each option
         raise UsageError(f"--density is a finite number > 0, not {density:g}")
     asked.need_density(*(["density"] if density is not None else []))
     with working(quiet) as work:
+
+        def goes_on(paths: int) -> bool:
+            work.begun = paths > 0  # there are results to keep
+            return not work.stop.is_set()
+
         records = {"memory": {"memory": 64}, "joint": {"joint": 32}}
         needed = slabs.records_of(level)
         c = asked.constants()
@@ -113,7 +119,7 @@ def main(  # noqa: PLR0913 - an argument for each option
         )  # fmt: skip
         result = slabs.measure(
             family, found, request, error, seed, asked.threads, paths,
-            lambda share, word: work.progress(0.3 + 0.7 * share, word),
+            lambda share, word: work.progress(0.3 + 0.7 * share, word), goes_on,
         )  # fmt: skip
     result = replace(result, edges=result.edges / crammed)
     name, size = family.tables[0].header["grain"]["name"], asked.told(words)
@@ -131,6 +137,12 @@ def main(  # noqa: PLR0913 - an argument for each option
         *([_as_much_mass(words, crammed, thickness)] if crammed > 1.0 else []),
         *found.notes,
     ]
+    if work.stop.is_set():
+        worst = max(float(result.reflectance_error.max()), float(result.transmittance_error.max()))
+        asked_for = f"an error of {error:g}" if paths is None else f"{paths} paths"
+        cut = f"interrupted: results of {result.paths} paths with errors up to {worst:.2g}, short of {asked_for}"
+        notes.insert(1, cut)
+        click.echo(cut, err=True)
     notes = [plain(note) for note in notes]
     if plot is not None:
         from tsdf.study import plots, spectral_plots
@@ -141,9 +153,11 @@ def main(  # noqa: PLR0913 - an argument for each option
         "material_density": words.sizes.material_density, "fresnel": family.tables[0].header["optics"]["fresnel"],
         "density": words.density, "packing_fraction": packing, "thickness_m": thickness, "angle_deg": angle,
         "ground": ground,
-        "paths": result.paths, "eta": result.eta.tolist(), "profile_edges_m": (radius * result.edges).tolist(),
+        "interrupted": work.stop.is_set(), "paths": result.paths, "eta": result.eta.tolist(),
+        "profile_edges_m": (radius * result.edges).tolist(),
     }  # fmt: skip
     spectral.tell(slabs.columns(result, found), facts, notes, as_json, csv_file, quiet or spectral.is_printed(csv_file))
+    return interrupt_status() if work.stop.is_set() else 0
 
 
 def _crammed(

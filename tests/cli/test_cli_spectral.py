@@ -3,14 +3,16 @@
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
 import tsdf
-from tsdf.cli import albedo, optics
+from tsdf.cli import albedo, common, optics
 from tsdf.reference_data.make_checks import CHECKS
+from tsdf.study import slabs
 
 CUBE = CHECKS / "cube_memory.tsdf.exr"
 SOME = ("--wavelength-nm", "400:1200:400", "--quiet")
@@ -197,6 +199,43 @@ def test_texts_go_to_standard_output(tmp_path: Path, monkeypatch: pytest.MonkeyP
         printed, filed = run(*some, option, "-"), run(*some, option, "file", "--quiet")
         assert printed.exit_code == filed.exit_code == 0 and filed.stdout == ""
         assert printed.stdout == (tmp_path / "file").read_text() and [*tmp_path.iterdir()] == [tmp_path / "file"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kept", [True, False])
+def test_an_interrupt_keeps_what_is_measured(kept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the first paths of all sets on; before there is nothing, and the signal ends the process by itself."""
+    works: list[common.Work] = []
+
+    class Known(common.Work):
+        def __init__(self, progress: common.Progress) -> None:
+            super().__init__(progress)
+            works.append(self)
+
+    measure = slabs.measure
+
+    def interrupted(*words: Any) -> Any:
+        *others, told, goes_on = words
+        assert works[0].meaning() == "nothing is written"
+
+        def heard(paths: int) -> bool:
+            goes_on(paths)
+            assert paths > 0 and (not kept or works[0].meaning() is None)
+            return bool(goes_on(paths))
+
+        return measure(*others, told, heard)
+
+    monkeypatch.setattr(common, "Work", Known)
+    monkeypatch.setattr(slabs, "measure", interrupted)
+    sheet = tmp_path / "a.csv"
+    error = 1e-4 if kept else 0.01
+    result = run(albedo, CUBE, *SOME[:2], "--thickness", "2mm", "--error", error, "--json", "--csv", sheet)
+    facts = json.loads(result.stdout)
+    assert facts["interrupted"] == kept and facts["paths"] == slabs.FEWEST and sheet.exists()
+    assert result.exit_code == (130 if kept else 0), result.output
+    said = f"interrupted: results of {slabs.FEWEST} paths with errors up to 0.00"
+    assert (said in result.stderr) == kept == any(said in note for note in facts["notes"])
+    assert (max(facts["reflectance_error"]) > error) == kept
 
 
 def test_near_wavelengths_keep_their_columns(tmp_path: Path) -> None:
