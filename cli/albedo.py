@@ -57,7 +57,7 @@ def main(  # noqa: PLR0913 - an argument for each option
     GRAIN is as of tsdf-build, or tables of one grain at several indices. All wavelengths are read off the same paths,
     followed at up to three refractive indices. Beside them, from the same single scattering: doubling, which is level
     volume without noise, two streams (delta-Eddington) and asymptotic theory. `between` is what n between the indices
-    may miss. An interrupt keeps what the paths so far have told.
+    may miss, `optical_depth` that of point scatterers. An interrupt keeps what the paths so far have told.
     """
     asked = spectral.Asked.of(grains, said)
     check_numbers(seed, said["threads"], paths=paths)

@@ -189,6 +189,10 @@ def test_points_need_no_room() -> None:
         assert dense[name] == pytest.approx(same[name], rel=1e-6)
         assert dense[name] != pytest.approx(other[name], rel=0.01)
     assert dense["profile_edges_m"] == pytest.approx([0.0, 1e-3, 2e-3])
+    assert dense["optical_depth"] == pytest.approx(same["optical_depth"], rel=1e-6)
+    for i, albedo_of in enumerate(json.loads(run(optics, CUBE, *SOME, "--ssa", 20, "--json").stdout)["albedo"]):
+        sigma = slabs.extinction(cube, 0.64, np.array([albedo_of])).item()
+        assert dense["optical_depth"][i] == pytest.approx(3.2e-3 / dense["radius_m"] * sigma, rel=1e-6)
 
 
 def test_texts_go_to_standard_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -501,7 +501,7 @@ class Theories(NamedTuple):
     """What theories say of a slab: from the same optical depth, albedo and g; `doubled` from the whole phase function.
 
     `between` is how far off two streams would be between the tables that paths are followed at; `surface` what k makes
-    of the surface, which paths do not know, by doubling.
+    of the surface, which paths do not know, by doubling; `optical_depth` that of the slab, (w,) float64.
     """
 
     two_streams: streams.Streams
@@ -509,6 +509,7 @@ class Theories(NamedTuple):
     doubled: streams.Streams
     between: np.ndarray
     surface: streams.Streams
+    optical_depth: np.ndarray
 
 
 def _theories(family: Family, found: Spectrum, request: Request, which: list[int]) -> Theories:
@@ -554,6 +555,7 @@ def _theories(family: Family, found: Spectrum, request: Request, which: list[int
     return Theories(
         eddington(depth(found.albedo), found.albedo, found.g),
         streams.Streams(*(np.where(thick, values, math.nan) for values in simple)), exact, between, surface,
+        depth(found.albedo),
     )  # fmt: skip
 
 
@@ -566,7 +568,7 @@ def records_of(level: str) -> str | None:
 def columns(result: Albedo, found: Spectrum) -> dict[str, np.ndarray]:
     """Return what a slab does as named columns; layers of the profile by number, from above."""
     sheet = {
-        "wavelength_nm": found.constants.wavelength_nm,
+        "wavelength_nm": found.constants.wavelength_nm, "optical_depth": result.theories.optical_depth,
         "reflectance": result.reflectance, "reflectance_error": result.reflectance_error,
         "between": result.theories.between,
         "transmittance": result.transmittance, "transmittance_error": result.transmittance_error,
