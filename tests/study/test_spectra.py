@@ -121,6 +121,13 @@ def test_wavelengths_that_are_none(text: str) -> None:
         spectra.wavelengths(text)
 
 
+def test_wavelengths_that_fall() -> None:
+    for text in ("5000:200:-1000", "5000:200:1000", "200:5000:-10", "200:5000:0"):
+        with pytest.raises(UsageError, match="FROM:TO:STEP rises"):
+            spectra.wavelengths(text)
+    assert spectra.wavelengths("300:300:10").tolist() == [300.0]
+
+
 @pytest.mark.slow
 def test_tables_that_make_no_family(ice: Constants) -> None:
     ball = found_tables(1.3, 1.31)

@@ -48,6 +48,8 @@ def wavelengths(text: str) -> np.ndarray:
         raise wrong("not numbers") from None
     found: list[float] = []
     for span in numbers:
+        if len(span) == 3 and (span[0] > span[1] or span[2] <= 0.0):
+            raise wrong("FROM:TO:STEP rises, FROM to TO by a STEP above 0")
         if not all(0.0 < number < 1e9 for number in span):
             raise wrong("each is above 0 and finite")
         if len(span) == 1:
