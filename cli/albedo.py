@@ -93,7 +93,14 @@ def main(  # noqa: PLR0913 - an argument for each option
         raise UsageError(f"--packing is above 0 and at most {MAX_PACKING_FRACTION:g}, not {packing:g}")
     if density is not None and not 0.0 < density < math.inf:
         raise UsageError(f"--density is a finite number > 0, not {density:g}")
-    asked.need_density(*(["density"] if density is not None else []))
+    if density is not None:
+        asked.need_density("density")
+        solid = asked.solid.get("material_density", math.inf)
+        if density > solid:
+            raise UsageError(
+                f"--density {density:g} kg/m3 is more than that of the material, {solid:g} kg/m3; say less, or another "
+                "--material-density"
+            )
     with working(quiet) as work:
 
         def goes_on(paths: int) -> bool:
@@ -137,12 +144,14 @@ def main(  # noqa: PLR0913 - an argument for each option
         *([_as_much_mass(words, crammed, thickness)] if crammed > 1.0 else []),
         *found.notes,
     ]
-    if work.stop.is_set():
-        worst = max(float(result.reflectance_error.max()), float(result.transmittance_error.max()))
+    worst = max(float(result.reflectance_error.max()), float(result.transmittance_error.max()))
+    short = work.stop.is_set() and (worst > error if paths is None else result.paths < paths)
+    if short:
         asked_for = f"an error of {error:g}" if paths is None else f"{paths} paths"
-        cut = f"interrupted: results of {result.paths} paths with errors up to {worst:.2g}, short of {asked_for}"
-        notes.insert(1, cut)
-        click.echo(cut, err=True)
+        notes.insert(
+            1, f"interrupted: results of {result.paths} paths with errors up to {worst:.2g}, short of {asked_for}"
+        )
+        click.echo(notes[1], err=True)
     notes = [plain(note) for note in notes]
     if plot is not None:
         from tsdf.study import plots, spectral_plots
@@ -153,11 +162,11 @@ def main(  # noqa: PLR0913 - an argument for each option
         "material_density": words.sizes.material_density, "fresnel": family.tables[0].header["optics"]["fresnel"],
         "density": words.density, "packing_fraction": packing, "thickness_m": thickness, "angle_deg": angle,
         "ground": ground,
-        "interrupted": work.stop.is_set(), "paths": result.paths, "eta": result.eta.tolist(),
+        "interrupted": short, "paths": result.paths, "eta": result.eta.tolist(),
         "profile_edges_m": (radius * result.edges).tolist(),
     }  # fmt: skip
     spectral.tell(slabs.columns(result, found), facts, notes, as_json, csv_file, quiet or spectral.is_printed(csv_file))
-    return interrupt_status() if work.stop.is_set() else 0
+    return interrupt_status() if short else 0
 
 
 def _crammed(

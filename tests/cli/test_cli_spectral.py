@@ -132,7 +132,13 @@ def test_what_albedo_refuses(arguments: tuple[object, ...], said: str) -> None:
 
 def test_what_is_wrong_is_said_before_tables_are_made() -> None:
     """Making them takes minutes."""
-    for arguments in (("--packing", 0.9), ("--ground", 2, "--thickness", "1mm"), ("--profile", -1), ("--paths", 1)):
+    for arguments in (
+        ("--packing", 0.9),
+        ("--density", 918),
+        ("--ground", 2, "--thickness", "1mm"),
+        ("--profile", -1),
+        ("--paths", 1),
+    ):
         result = run(albedo, "snow", "--table-paths", "1e18", *arguments)
         assert result.exit_code == 2 and result.output.count("\n") == 1, result.output
 
