@@ -204,8 +204,11 @@ def _as_much_mass(words: "InWords", crammed: float, thickness: float | None) -> 
     """Return the note on grains that are denser than their bounding spheres can be packed."""
     from tsdf.scene.sizes import DENSEST_RANDOM
 
-    body = "of a half-space" if thickness is None else f"in a slab of {1e3 * crammed * thickness:.4g} mm"
+    body = (
+        "; of a half-space that only says how deep light goes" if thickness is None else
+        f", in a slab of {1e3 * crammed * thickness:.4g} mm, which has the same mass per area"
+    )  # fmt: skip
     return (
         f"{words.density:.4g} kg/m3 would take a packing fraction of {words.fraction:.3g}: free paths are those of "
-        f"{DENSEST_RANDOM:g}, {(words.density or 0.0) / crammed:.3g} kg/m3, {body}, which has the same mass per area"
+        f"{DENSEST_RANDOM:g}, {(words.density or 0.0) / crammed:.3g} kg/m3{body}"
     )

@@ -71,7 +71,7 @@ def is_stream(path: str | os.PathLike[str]) -> bool:
     Where standard output is redirected to a file, /dev/stdout leads to it, and the file would be replaced by what was
     meant to be added to it.
     """
-    here = Path(os.path.abspath(path))
+    here = Path(path).absolute()
     for _ in range(MOST_LINKS):
         here = Path(os.path.realpath(here.parent)) / here.name
         if here.parts[:2] == ("/", "proc") or str(here.parent) in ("/dev", "/dev/fd"):
