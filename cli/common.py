@@ -199,7 +199,7 @@ def check_outputs(outputs: Sequence[Output], *inputs: Path, part: bool = False) 
         if shown != os.fspath(path):
             raise UsageError(f"cannot write {shown}: its name cannot be shown on one line; choose another {option}")
         if files.is_stream(path):
-            ways = f"give {option} the name of a file" + (f", or {printed}" if printed else "")
+            ways = f"choose another {option}" + (f", or {printed}" if printed else "")
             raise TSDFError(
                 f"cannot write {shown}: it is no regular file but a stream (screen, pipe or device); {ways}"
             )

@@ -254,7 +254,7 @@ def test_what_standard_output_goes_to_stays(inputs: Path) -> None:
                 [*command, "--to", "csv", "--out", name], stdout=stdout, stderr=subprocess.PIPE, text=True, check=False
             )  # fmt: skip
         assert done.returncode == 1 and log.read_text() == "kept\n"
-        assert done.stderr.count("\n") == 1 and "give --out the name of a file, or leave it out" in done.stderr
+        assert done.stderr.count("\n") == 1 and "choose another --out, or leave it out" in done.stderr
 
 
 def full(*_: object) -> None:
