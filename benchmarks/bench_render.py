@@ -6,10 +6,11 @@ against teleport. Multiply scattered light is the diffuse reflectance of a thick
 grain sends back at its first event is a few per cent of it, and its share is stated. (c) Beside each, a furnace of
 radiance 1 around the same grains, which must read 1: a fast wrong answer shows. (d) The explicit level's rays per
 second against what the ray engine alone makes of the very same rays. (e) Where pictures are made: a cube of 4 R, balls
-of 80 to 80,000 facets and grains of 1/10 to 1/100,000 of them, beside the bulk, and the scenes of scenes/ where `make
-demo` has made their tables. What is compared runs in turn in one process; numbers are medians over rounds, ratios
-medians of the ratios of a round. Where others share the machine, processor time is steadier than the wall's: (b) and
-(d) use it, (a) gives both, and the scaling of two kernels that share nothing, which is what the machine has to give.
+of 80 to 80,000 facets and grains of 1/10 to 1/100,000 of them, beside the bulk, whose walkers go one by one or are in
+lanes, and the scenes of scenes/ where `make demo` has made their tables. What is compared runs in turn in one process;
+numbers are medians over rounds, ratios medians of the ratios of a round. Where others share the machine, processor time
+is steadier than the wall's: (b) and (d) use it, (a) gives both, and the scaling of two kernels that share nothing,
+which is what the machine has to give.
 """
 
 import argparse
@@ -313,20 +314,34 @@ def near(table: Table, rounds: int, spp: int, folder: Path) -> list[str]:
             print(f"{name}.toml is left out: make tables makes its tables")
     for one in (bulk, *made.values()):
         render.render(one, spp=1, threads=1)
+    one_by_one(bulk, 16, 0)
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in made}
-    shares: dict[str, list[float]] = {name: [] for name in made}
+    shares: dict[str, list[tuple[float, float]]] = {name: [] for name in made}
     for k in range(rounds):
         deep, cpu = cost(bulk, 4096, k)
-        base = cpu / deep.events
+        base, single = cpu / deep.events, one_by_one(bulk, 1024, k)
         for name, one in made.items():
             picture, cpu = cost(one, spp, k)
             times[name].append((1e6 * cpu / picture.samples.sum(), 1e9 * cpu / picture.events))
-            shares[name].append(cpu / picture.events / base)
-    text = ["| scene | CPU us per sample | ns per event | over the bulk's |", "|---|---|---|---|"]
+            shares[name].append((cpu / picture.events / single, cpu / picture.events / base))
+    text = [
+        "| scene | CPU us per sample | ns per event | over the bulk's, walkers one by one | in lanes |",
+        "|---|---|---|---|---|",
+    ]
     for name in made:
         sample, event = (statistics.median(column) for column in zip(*times[name], strict=True))
-        text.append(f"| {name} | {sample:.2f} | {event:.0f} | {statistics.median(shares[name]):.1f} |")
+        alone, lanes = (statistics.median(column) for column in zip(*shares[name], strict=True))
+        text.append(f"| {name} | {sample:.2f} | {event:.0f} | {alone:.1f} | {lanes:.1f} |")
     return text
+
+
+def one_by_one(made: world.World, samples: int, seed: int) -> float:
+    """Return the processor time [s] per event of so many samples of one pixel, of walkers that are not in lanes."""
+    walkers = Walkers(made)
+    walkers.lanes = None
+    start = time.process_time()
+    walkers.follow(Job(world.camera_of(made), 0, samples, 0, seed), 1, threading.Event())
+    return (time.process_time() - start) / float(walkers.counters[EVENTS])
 
 
 def cost(made: world.World, spp: int, seed: int) -> tuple[Picture, float]:

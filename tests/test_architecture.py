@@ -19,7 +19,7 @@ ROOT = PACKAGE.parent
 ROOMS = ["", "grain", "data", "judge", "make", "spheres", "scene", "walk", "picture", "study", "plan", "stress"]
 ROOT_MODULES = {"archive", "compiled", "errors", "files", "handle", "sampling", "simplex", "vectors"}
 DOORS = {
-    "numba": {"compiled", "handle"},
+    "numba": {"compiled", "handle", "wide"},
     "DracoPy": {"gltf"},
     "collada": {"meshes"},
     "trimesh": {"meshes"},

@@ -181,7 +181,7 @@ def test_ways_meet_what_rays_do(name: str, meshes, table) -> None:
     facets that one ray at a time does; moved a little to the side, some do not."""
     field = world.build(scene_of(meshes[name], (ONE,), GrainSpec(table)), "teleport").place.arrays.grid
     rng, many = np.random.default_rng(5), 6000
-    corners = field.facets[:, 4:13].reshape(-1, 3, 3)
+    corners = field.facets.reshape(-1, 4, 4)[:, 1:, :3].transpose(0, 2, 1)
     p, d = rng.uniform(-6.0, 6.0, (many, 3)), rng.normal(size=(many, 3))
     aims = corners[rng.integers(0, len(corners), many)]
     d[: many // 3] = (aims[:, 0] - p)[: many // 3]

@@ -138,13 +138,13 @@ def test_what_stands_for_many_facets_hides_none(cells: int) -> None:
     met, known = rays(grid, p, d, end)
     assert known.mean() > 0.9 and (true >= 0).mean() > 0.5
     assert (met[:, 0] == true)[known].all()
-    thin, small = grid.slabs.copy(), grid.listed.copy()
+    thin, small = grid.slabs.copy(), grid.boxes.copy()
     middle = 0.5 * (thin["low"] + thin["high"])
     thin["low"], thin["high"] = 0.5 * (thin["low"] + middle), 0.5 * (thin["high"] + middle)
     met, known = rays(grid._replace(slabs=thin), p, d, end)
     assert (met[:, 0] != true)[known].any()
-    small.view(np.uint8).reshape(-1, 8)[:, 5] //= 2
-    met, known = rays(grid._replace(listed=small), p, d, end)
+    small.view(np.uint8).reshape(-1, 4)[:, 1] //= 2
+    met, known = rays(grid._replace(boxes=small), p, d, end)
     assert (met[:, 0] != true)[known].any()
 
 

@@ -16,9 +16,8 @@ from tsdf.compiled import njit
 from tsdf.data.sampler import leave
 from tsdf.sampling import GOLDEN, mix, unit
 from tsdf.vectors import KERNEL, dot, renewed, step
-from tsdf.walk import lanes as L
 from tsdf.walk.geometry import MESH, Geometry
-from tsdf.walk.grid import NONE, free_around, held, plane_hit, slipped
+from tsdf.walk.grid import NONE, THICK, free_around, held, plane_hit, slipped
 from tsdf.walk.lanes import (
     AIMED,
     BACK,
@@ -27,6 +26,7 @@ from tsdf.walk.lanes import (
     COSINE,
     DX,
     FREE,
+    HANDED,
     KEY,
     LIGHT,
     LIVE,
@@ -37,22 +37,39 @@ from tsdf.walk.lanes import (
     NEXT,
     ONCE,
     ONE,
+    PDF,
     PHI,
     PX,
     STATE,
+    STEPS,
     TURN,
     TX,
     WAITS,
     WALKS,
     WAY,
+    WEIGHT,
     WIDTH,
     Lanes,
     R,
     Z,
+    absorb,
     at,
+    beam,
+    begin,
+    brighten,
+    choose,
+    close,
+    crowded,
     deep,
+    deflect,
+    ended,
     lanes_of,
+    lot,
     put,
+    replace,
+    settle,
+    soars,
+    sort,
     three,
     wait,
 )
@@ -101,7 +118,7 @@ def found(grid, facet, p, d):
     """Return where a way meets the plane of its facet, how steeply, its normal and its thickness."""
     t, cosine = plane_hit(grid.facets, facet, p, d)
     n = (grid.facets[facet, 0], grid.facets[facet, 1], grid.facets[facet, 2])
-    return t, cosine, n, grid.facets[facet, 13]
+    return t, cosine, n, grid.facets[facet, THICK]
 
 
 # ------------------------------------------------------------------------------------------- from outside
@@ -150,8 +167,8 @@ def arrive(world, crowd, count):
     for k in range(count):
         i = WIDTH + k
         crowd.outer[k] = i
-        numbers[at(L.PDF, i)], numbers[at(FREE, i)] = -1.0, FRESH
-        numbers[at(LUCK, i)], numbers[at(L.WEIGHT, i)], words[at(MET, i)] = 0.0, 1.0, np.uint64(0)
+        numbers[at(PDF, i)], numbers[at(FREE, i)] = -1.0, FRESH
+        numbers[at(LUCK, i)], numbers[at(WEIGHT, i)], words[at(MET, i)] = 0.0, 1.0, np.uint64(0)
         for a in range(lanes.amounts.shape[1]):
             lanes.amounts[i, a] = 0.0
     return enter(world, crowd, count)
@@ -361,11 +378,11 @@ def connect(world, batch, crowd):
         bound = numbers[at(BOUND, i)]
         if bound < 8.0 * mean:
             numbers[at(BOUND, i)] = max(bound, free_around(grid, three(numbers, PX, i), reach))
-        L.lot(numbers, words, i)
-    L.beam(world, lanes)
+        lot(numbers, words, i)
+    beam(world, lanes)
     inner, outer = jump(world, crowd)
     shade(world, crowd, inner, outer)
-    L.light(world, batch, lanes)
+    brighten(world, batch, lanes)
 
 
 @njit(**KERNEL)
@@ -492,25 +509,25 @@ def back(world, crowd, count):
 def welcome(world, batch, crowd, job, count):
     """Make the next samples ready, so many, as far as they come to a grain."""
     lanes = crowd.lanes
-    L.begin(lanes, job, lanes.counts[NEXT], count)
+    begin(lanes, job, lanes.counts[NEXT], count)
     lanes.counts[NEXT] += count
     start(world, crowd, arrive(world, crowd, count))
-    for k in range(L.sort(lanes, count)):
-        L.settle(world, batch, lanes, lanes.others[k])
+    for k in range(sort(lanes, count)):
+        settle(world, batch, lanes, lanes.others[k])
 
 
 @njit(**KERNEL)
 def relieve(world, batch, crowd, job, total):
     """Settle the lanes that walk no more and let others have their place."""
     lanes = crowd.lanes
-    counts, gone = lanes.counts, L.ended(lanes)
+    counts, gone = lanes.counts, ended(lanes)
     for k in range(gone):
-        L.settle(world, batch, lanes, lanes.gone[k])
-    gone = L.replace(lanes, gone)
-    while (gone > 0 or counts[LIVE] < WIDTH) and counts[NEXT] < total and not L.crowded(batch, lanes):
+        settle(world, batch, lanes, lanes.gone[k])
+    gone = replace(lanes, gone)
+    while (gone > 0 or counts[LIVE] < WIDTH) and counts[NEXT] < total and not crowded(batch, lanes):
         welcome(world, batch, crowd, job, min(WIDTH, total - counts[NEXT]))
-        gone = L.replace(lanes, gone)
-    L.close(lanes, gone)
+        gone = replace(lanes, gone)
+    close(lanes, gone)
 
 
 @njit(**KERNEL)
@@ -522,7 +539,7 @@ def soar(world, batch, crowd):
         count = 0
         for i in range(lanes.counts[LIVE]):
             waits = words[at(STATE, i)] != np.uint64(WALKS) or numbers[at(WAITS, i)] > 0.0
-            if not waits and L.soars(world, batch, lanes, i):
+            if not waits and soars(world, batch, lanes, i):
                 crowd.flying[count] = i
                 count += 1
         start(world, crowd, count)
@@ -536,9 +553,9 @@ def walk(world, batch, crowd, job, total):
     """Walk the samples of a job, `total` of them, as `lanes.walk` does."""
     lanes, leaps = crowd.lanes, deep(world.leaps)
     counts = lanes.counts
-    counts[L.HANDED] = 0
-    for _ in range(L.STEPS):
-        if L.crowded(batch, lanes):
+    counts[HANDED] = 0
+    for _ in range(STEPS):
+        if crowded(batch, lanes):
             break
         count = 0
         for i in range(counts[LIVE]):
@@ -550,12 +567,12 @@ def walk(world, batch, crowd, job, total):
             relieve(world, batch, crowd, job, total)
         if counts[LIVE] == 0:
             break
-        L.choose(world.media, lanes)
+        choose(world.media, lanes)
         if world.lights.sampled:
             connect(world, batch, crowd)
-        L.deflect(world, lanes)
+        deflect(world, lanes)
         outer = land(world, crowd)
         if lanes.amounts.shape[1] > 0:
-            L.absorb(world, batch, lanes)
+            absorb(world, batch, lanes)
         enter(world, crowd, outer)
         batch.counters[EVENTS] += counts[LIVE]

@@ -8,6 +8,8 @@ import math
 
 import numpy as np
 
+from tsdf.walk.wide import WIDE
+
 BATCH = 1 << 17  # triangles and boxes that are looked at together
 PAD = 0.004  # [cells] facets count as in a cell when this near to it, far more than the rounding of the way through
 ROUNDING = 1e-13  # of coordinates: some hundreds of the last bits of heights; what leans outward by less is flat
@@ -17,12 +19,11 @@ FINER = (math.sqrt(3.0) - 1.0) / 255.0  # of it: that is at most so much farther
 BLUR = 1e-3  # of that: more than float32 rounds
 HALF_DIAGONAL = math.sqrt(0.75)  # [cells]
 FEW = 3  # facets in a cell, with more of which none is looked at that can be told from the cell alone
-AHEAD = 16  # rows of facets that are fetched before it is known whether a cell has as many
 SIDES = 256  # parts of a cell a side, across the direction of its slab
 LINE = 64  # bytes of a line of a processor's cache
 # A unit vector, between which heights along it all is that is in a cell of its facets, and where in a list they are;
 # two fill a line
-SLAB = np.dtype([("way", "3f4"), ("low", "f4"), ("high", "f4"), ("first", "i4"), ("last", "i4"), ("spare", "i4")])
+SLAB = np.dtype([("way", "3f4"), ("low", "f4"), ("high", "f4"), ("first", "i4"), ("last", "i4"), ("axis", "i4")])
 
 
 def meets(corners: np.ndarray, planes: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -73,10 +74,13 @@ def free_of(far: np.ndarray, edge: float) -> np.ndarray:
 
 def listed_of(
     corners: np.ndarray, planes: np.ndarray, middles: np.ndarray, edge: float, first: np.ndarray, listed: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return `slabs` and `listed` of a `grid.Grid`: (n, 2) the facets and, a byte each, the lowest and the highest part
-    of the cell, of SIDES a side, that they may be in, along the two axes that follow that nearest to the slab's way,
-    where they are more than FEW; and AHEAD more, of nothing.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return `slabs`, `listed` and `boxes` of a `grid.Grid`: what is in each cell, the facets, and where in it these
+    are, where they are more than FEW; and WIDE more, of nothing.
+
+    A box is, a byte each, the lowest and the highest part of the cell, of SIDES a side, that a facet may be in, along
+    the two axes that follow that nearest to the slab's way. Of the lowest is kept what is missing to the last part:
+    facets whose boxes meet one have at least as much in each byte as `grid.boxed` has of that.
 
     Parameters
     ----------
@@ -89,20 +93,20 @@ def listed_of(
     """
     slabs, many = lined(len(middles), SLAB), np.diff(first)
     slabs["first"], slabs["last"] = first[:-1], first[1:]
-    both = np.zeros((len(listed) + AHEAD, 2), np.int32)
-    both[: len(listed), 0] = listed
+    boxes = np.zeros(len(listed) + WIDE, np.int32)
     off = ROUNDING * float(np.abs(corners).max()) + HAIR * edge
     begins = np.unique(np.searchsorted(first, np.arange(0, len(listed), BATCH), "right") - 1)
     for begin, end in zip(begins, np.append(begins, len(many))[1:], strict=True):
         here, there = slice(begin, end), slice(first[begin], first[end])
         own, at = listed[there], first[here] - first[begin]
         way, low, high = _slabs(corners[own], planes[own], at, middles[here], (edge, off))
+        slabs["axis"][here] = np.abs(way).argmax(axis=1)
         slabs["way"][here], slabs["low"][here], slabs["high"][here] = way, low, high
         boxed = np.flatnonzero(many[here].repeat(many[here]) > FEW)
         row = np.arange(len(at)).repeat(many[here])[boxed]
         places = (corners[own[boxed]] - middles[here][row][:, None]) / edge + 0.5
-        both[first[begin] + boxed, 1] = _boxes(places, np.abs(way).argmax(axis=1)[row])
-    return slabs, both
+        boxes[first[begin] + boxed] = _boxes(places, np.abs(way).argmax(axis=1)[row])
+    return slabs, np.append(listed, np.zeros(WIDE, np.int32)), boxes
 
 
 def lined(many: int, kind: np.dtype) -> np.ndarray:
@@ -160,7 +164,7 @@ def _boxes(places: np.ndarray, axis: np.ndarray) -> np.ndarray:
         for shift, end in ((0, low), (8, high)):
             x = end[row, (axis + k) % 3]
             result |= np.clip(x * SIDES, 0, SIDES - 1).astype(np.uint32) << (16 * (k - 1) + shift)
-    return result.view(np.int32)
+    return (result ^ np.uint32(0x00FF00FF)).view(np.int32)
 
 
 def _batches(*arrays: np.ndarray) -> list[tuple[np.ndarray, ...]]:

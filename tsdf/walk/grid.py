@@ -17,6 +17,7 @@ from tsdf.compiled import njit
 from tsdf.handle import Handle
 from tsdf.vectors import KERNEL, dot, step, triple
 from tsdf.walk.cells import FEW, FINER, HALF_DIAGONAL, MET, SIDES, SLAB, cells_of, lined, listed_of
+from tsdf.walk.wide import WIDE, lowest, over, turned
 
 STEPS = 64  # of a ray through the grid; the ray engine is faster with those that need more
 OUTSIDE = 16  # facets that reach out of the grid, with more of which rays that leave it are left to the ray engine
@@ -29,6 +30,7 @@ BEYOND = 1.0 + 1e-9  # walls of cells that a ray has passed, or nearly so, count
 NEAR = 1e-7  # [cells] that near to a facet, on which side of it a place is is not asked
 MOST_MEDIA = 2**15 - 1  # whose numbers a grid has room for
 NONE, UNKNOWN = -1, -2
+THICK = 7  # a number of `Grid.facets`
 
 
 class Grid(NamedTuple):
@@ -36,13 +38,14 @@ class Grid(NamedTuple):
 
     low (3,), edge: its corner and the edge of a cell; shape (3,): how many along each axis; far (x y z,) uint16: how
     far the nearest of those with facets is, see `cells.far_of`, and below MET in those; cells (x y z,) int32: the
-    number of such a cell among them; slabs (occupied,) of cells.SLAB: what is in each; listed (n, 2) int32: the
+    number of such a cell among them; slabs (occupied,) of cells.SLAB: what is in each; listed, boxes (n,) int32: the
     facets in each, one cell after the other, and where in it they are, see `cells.listed_of`; home (x y z,) int16: the
     medium in whose mesh a place near each cell's middle is, see `mark`, NONE or UNKNOWN, empty where no medium has a
     mesh; outer: the facets that reach out of the grid, if there are no more than OUTSIDE; closed: rays that leave the
-    grid meet nothing else; beyond: distances outside it are at least those to the grid. facets (f, 16): normal, height
-    over the origin, the three corners, and how near to it counts as on it, two lines of a processor's cache; mesh (f,)
-    int32: the number of the facet's mesh; owner (meshes,) int32: the medium whose boundary it is, NONE for surfaces;
+    grid meet nothing else; beyond: distances outside it are at least those to the grid. facets (f, 16), two lines of a
+    processor's cache: normal and height over the origin, where the corners are along x and as THICK how near to it
+    counts as on it, and from 8 and 12 on where they are along y and z; mesh (f,) int32: the number of the facet's mesh;
+    owner (meshes,) int32: the medium whose boundary it is, NONE for surfaces;
     margin: how far behind each other rays may meet facets, wholly inside the grid, that are at one place.
     """
 
@@ -53,6 +56,7 @@ class Grid(NamedTuple):
     cells: np.ndarray
     slabs: np.ndarray
     listed: np.ndarray
+    boxes: np.ndarray
     home: np.ndarray
     outer: np.ndarray
     closed: bool
@@ -77,16 +81,6 @@ def plane_hit(facets, facet, p, d):
 
 
 @njit(forceinline=True, **KERNEL)
-def turns(a, b):
-    """Return on which side of the edge from a to b, pairs of coordinates, the origin is; the opposite for the edge from
-    b to a, even where it is on it."""
-    area = a[0] * b[1] - a[1] * b[0]
-    if area != 0.0:
-        return area > 0.0
-    return a[0] < b[0] if a[0] != b[0] else a[1] < b[1]
-
-
-@njit(forceinline=True, **KERNEL)
 def line_of(p, d):
     """Return the line through p along d as `passes` takes it: the numbers of two axes and of that along which it runs
     most, p in that order, and how far it goes along the two for each unit along the third."""
@@ -97,19 +91,11 @@ def line_of(p, d):
     return (0, 1, 2), p, d[0] / d[2], d[1] / d[2]
 
 
-@njit(**KERNEL)
+@njit(forceinline=True, **KERNEL)
 def passes(facets, facet, line):
-    """Return whether a line passes within a facet: whether its corners, seen along it, turn around it all one way
-    (Woop et al. 2013)."""
-    (i, j, k), (x, y, z), u, v = line
-    far = facets[facet, 4 + k] - z
-    a = (facets[facet, 4 + i] - x - u * far, facets[facet, 4 + j] - y - v * far)
-    far = facets[facet, 7 + k] - z
-    b = (facets[facet, 7 + i] - x - u * far, facets[facet, 7 + j] - y - v * far)
-    side = turns(a, b)
-    far = facets[facet, 10 + k] - z
-    c = (facets[facet, 10 + i] - x - u * far, facets[facet, 10 + j] - y - v * far)
-    return turns(b, c) == side and turns(c, a) == side
+    """Return whether a line passes within a facet, see `turned`."""
+    axes, p, u, v = line
+    return turned(facets, facet, axes, p, (u, v))
 
 
 @njit(forceinline=True, **KERNEL)
@@ -153,7 +139,7 @@ def free_around(grid, p, least):
                 wall = min(wall, SHORTER * max(slab.low - at, at - slab.high))
                 there = here
             for at in range(here, there):
-                f = grid.listed[at, 0]
+                f = grid.listed[at]
                 n = (grid.facets[f, 0], grid.facets[f, 1], grid.facets[f, 2])
                 wall = min(wall, abs(dot(n, p) - grid.facets[f, 3]))
                 if wall <= max(bound, least):
@@ -192,22 +178,21 @@ def asked(grid, cell, p, d, inside):
     n = triple(slab.way)
     at, by = dot(n, p), dot(n, d)
     a, b = at + inside[0] * by, at + inside[1] * by
-    here, there, box = int(slab.first), int(slab.last), (0, SIDES - 1, 0, SIDES - 1)
+    here, there, box = int(slab.first), int(slab.last), np.uint32(0)
     if min(a, b) > slab.high or max(a, b) < slab.low:  # it is on one side of all of them
         there = here
     elif there - here > FEW:
         each = inverse(by)
         a, b = (slab.low - at) * each, (slab.high - at) * each
         a, b = max(inside[0], min(a, b)), min(inside[1], max(a, b))
-        box = box_around(grid, cell, n, step(p, a, d), step(p, b, d))
+        box = box_around(grid, cell, slab.axis, step(p, a, d), step(p, b, d))
     return here, there, box
 
 
 @njit(forceinline=True, **KERNEL)
-def boxed(box, its):
-    """Return whether a facet's box, as it is listed, meets another: the lowest and highest parts along two axes."""
-    u = box[0] <= (its >> 8 & 255) and box[1] >= (its & 255)
-    return u and box[2] <= (its >> 24 & 255) and box[3] >= (its >> 16 & 255)
+def among(grid, here, there, box):
+    """Return which of the next WIDE facets of a list, which ends, have boxes that meet another: a bit for each."""
+    return over(grid.boxes, here, box) & ((1 << min(there - here, WIDE)) - 1)
 
 
 @njit(forceinline=True, **KERNEL)
@@ -215,42 +200,44 @@ def searched(grid, met, m, cell, p, d, inside, end):
     """Note in `met` which facets of an occupied cell a ray in medium m meets, that is in it between two distances;
     return how far it is still of interest."""
     here, there, box = asked(grid, cell, p, d, inside)
-    for at in range(here, there):
-        if boxed(box, grid.listed[at, 1]):
-            end = min(end, compared(grid, met, m, grid.listed[at, 0], p, d, end) + grid.margin)
+    while here < there:
+        bits = among(grid, here, there, box)
+        while bits != 0:
+            facet = grid.listed[here + lowest(bits)]
+            end = min(end, compared(grid, met, m, facet, p, d, end) + grid.margin)
+            bits &= bits - 1
+        here += WIDE
     return end
 
 
 @njit(**KERNEL)
-def box_around(grid, cell, n, p, q):
-    """Return the lowest and the highest part of a cell, of SIDES a side, on the way from p to q in it: along the two
-    axes that follow that nearest to n."""
+def box_around(grid, cell, axis, p, q):
+    """Return the box on the way from p to q in a cell, as of `boxed`: along the two axes that follow one."""
     ny, nz = grid.shape[1], grid.shape[2]
-    i, rest = cell // (ny * nz), cell % (ny * nz)
-    return box_in(grid, (float(i), float(rest // nz), float(rest % nz)), n, p, q)
+    i, rest, size, low = cell // (ny * nz), cell % (ny * nz), 1.0 / grid.edge, grid.low
+    j, k = rest // nz, rest % nz
+    x = ((p[0] - low[0]) * size - i, (p[1] - low[1]) * size - j, (p[2] - low[2]) * size - k)
+    y = ((q[0] - low[0]) * size - i, (q[1] - low[1]) * size - j, (q[2] - low[2]) * size - k)
+    if axis == 0:
+        return boxed((x[1], x[2]), (y[1], y[2]))
+    if axis == 1:
+        return boxed((x[2], x[0]), (y[2], y[0]))
+    return boxed((x[0], x[1]), (y[0], y[1]))
 
 
 @njit(forceinline=True, **KERNEL)
-def box_in(grid, cell, n, p, q):
-    """Return what `box_around` does, for a cell by its numbers along the axes."""
-    i, j, k = cell
-    size = 1.0 / grid.edge
-    x = ((p[0] - grid.low[0]) * size - i, (p[1] - grid.low[1]) * size - j, (p[2] - grid.low[2]) * size - k)
-    y = ((q[0] - grid.low[0]) * size - i, (q[1] - grid.low[1]) * size - j, (q[2] - grid.low[2]) * size - k)
-    a, b, c = abs(n[0]), abs(n[1]), abs(n[2])
-    if a >= max(b, c):
-        u, v = (x[1], y[1]), (x[2], y[2])
-    elif b >= c:
-        u, v = (x[2], y[2]), (x[0], y[0])
-    else:
-        u, v = (x[0], y[0]), (x[1], y[1])
-    return part(min(u[0], u[1])), part(max(u[0], u[1])), part(min(v[0], v[1])), part(max(v[0], v[1]))
+def boxed(p, q):
+    """Return the box between two places in a cell, in units of it, along two axes, as `over` takes it to find boxes of
+    `cells.listed_of` that meet it: where it begins, theirs end, and the other way around."""
+    high = np.uint32(SIDES - 1)
+    u = part(max(p[0], q[0])) ^ high | part(min(p[0], q[0])) << np.uint32(8)
+    return u | (part(max(p[1], q[1])) ^ high) << np.uint32(16) | part(min(p[1], q[1])) << np.uint32(24)
 
 
 @njit(forceinline=True, **KERNEL)
 def part(x):
     """Return in which of the parts of a cell x, in units of it, is."""
-    return min(max(int(x * SIDES), 0), SIDES - 1)
+    return np.uint32(np.int64(min(max(x * SIDES, 0.0), SIDES - 1.0)))
 
 
 @njit(**KERNEL)
@@ -264,7 +251,7 @@ def march(grid, met, m, p, d, end):
         met[e] = NONE
     for at in range(grid.outer.shape[0]):
         facet = grid.outer[at]
-        end = min(end, compared(grid, met, m, facet, p, d, end + GRAZING * grid.facets[facet, 13]))
+        end = min(end, compared(grid, met, m, facet, p, d, end + GRAZING * grid.facets[facet, THICK]))
     end += grid.margin
     nx, ny, nz = grid.shape[0], grid.shape[1], grid.shape[2]
     size = 1.0 / grid.edge
@@ -338,13 +325,15 @@ def crossings(grid, sums, cell, line, p, q):
     if grid.far[cell] >= MET:
         return
     here, there, box = asked(grid, cell, p, (q[0] - p[0], q[1] - p[1], q[2] - p[2]), (0.0, 1.0))
-    for at in range(here, there):
-        if not boxed(box, grid.listed[at, 1]):
-            continue
-        facet = grid.listed[at, 0]
-        over = height(grid, facet, p) > 0.0
-        if over != (height(grid, facet, q) > 0.0) and passes(grid.facets, facet, line):
-            sums[grid.mesh[facet]] += 1 if over else -1
+    while here < there:
+        bits = among(grid, here, there, box)
+        while bits != 0:
+            facet = grid.listed[here + lowest(bits)]
+            above = height(grid, facet, p) > 0.0
+            if above != (height(grid, facet, q) > 0.0) and passes(grid.facets, facet, line):
+                sums[grid.mesh[facet]] += 1 if above else -1
+            bits &= bits - 1
+        here += WIDE
 
 
 @njit(**KERNEL)
@@ -436,7 +425,7 @@ def find_homes(grid, home, sums):
                 cell, here = (i * ny + j) * nz + k, mark(grid, i, j, k)
                 begin, end = list_of(grid, cell)
                 for at in range(begin, end):
-                    if abs(height(grid, grid.listed[at, 0], here)) < NEAR * grid.edge:
+                    if abs(height(grid, grid.listed[at], here)) < NEAR * grid.edge:
                         home[cell] = UNKNOWN
 
 
@@ -467,11 +456,12 @@ def grid_of(meshes: Sequence[np.ndarray], owner: np.ndarray, planes: np.ndarray,
     mesh = np.repeat(np.arange(len(meshes)), [len(each) for each in meshes]).astype(np.int32)
     low, high = box
     facets = lined(len(corners), np.dtype("16f8"))
-    facets[:, :4], facets[:, 4:13], facets[:, 13] = planes, corners.reshape(-1, 9), thickness
+    facets[:, :4], facets[:, THICK] = planes, thickness
+    facets.reshape(-1, 4, 4)[:, 1:, :3] = corners.transpose(0, 2, 1)
     if not len(corners) or not cells:
         nothing = np.zeros(0, np.int32)
         return Grid(np.zeros(3), 1.0, (0, 0, 0), np.zeros(0, np.uint16), nothing, np.zeros(0, SLAB),
-                    np.zeros((0, 2), np.int32), np.zeros(0, np.int16), nothing, not len(corners), not len(corners),
+                    nothing, nothing, np.zeros(0, np.int16), nothing, not len(corners), not len(corners),
                     facets, mesh, owner, 0.0)  # fmt: skip
     size = np.maximum(high - low, 1e-3 * (high - low).max())
     sides = np.sort(np.clip(corners.max(axis=1), low, high) - np.clip(corners.min(axis=1), low, high), axis=1)
@@ -491,10 +481,11 @@ def grid_of(meshes: Sequence[np.ndarray], owner: np.ndarray, planes: np.ndarray,
     number = np.full(far.size, NONE, np.int32)
     number[occupied] = np.arange(len(occupied))
     middles = low + edge * (0.5 + np.stack(np.unravel_index(occupied, counts), axis=1))
-    slabs, listed = listed_of(corners, planes, middles, edge, first[np.append(occupied, -1)], listed)
+    slabs, listed, boxes = listed_of(corners, planes, middles, edge, first[np.append(occupied, -1)], listed)
     reaching = outer.nonzero()[0].astype(np.int32)[: OUTSIDE * few]
     shape = int(counts[0]), int(counts[1]), int(counts[2])
-    grid = Grid(low, edge, shape, far, number, slabs, listed, home, reaching, few, beyond, facets, mesh, owner, margin)
+    grid = Grid(low, edge, shape, far, number, slabs, listed, boxes, home, reaching, few, beyond, facets, mesh, owner,
+                margin)  # fmt: skip
     if home.size:
         find_homes(Handle(grid), grid.home, np.zeros(len(owner), np.int32))
     return grid

@@ -366,7 +366,7 @@ def connect(world, batch, lanes):
         lot(numbers, words, i)
     beam(world, lanes)
     shade(g, media, lanes)
-    light(world, batch, lanes)
+    brighten(world, batch, lanes)
 
 
 @njit(forceinline=True, **KERNEL)
@@ -402,7 +402,7 @@ def beam(world, lanes):
 
 
 @njit(**KERNEL)
-def light(world, batch, lanes):
+def brighten(world, batch, lanes):
     """Give samples the light that is aimed and comes through, see `shade`."""
     media, numbers, words = world.media, lanes.numbers, lanes.words
     for i in range(lanes.counts[LIVE]):

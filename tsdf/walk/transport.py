@@ -34,7 +34,7 @@ from tsdf.vectors import KERNEL, cross, dot, frame, minus, renewed, step, triple
 from tsdf.walk import explicit as X
 from tsdf.walk import memory as M
 from tsdf.walk.geometry import MESH, NONE, Geometry, ball_hit, clearance, exact_hit, unmet
-from tsdf.walk.grid import GRAZING, held, home_of, march, plane_hit, slipped
+from tsdf.walk.grid import GRAZING, THICK, held, home_of, march, plane_hit, slipped
 from tsdf.walk.hybrid import hand_over
 from tsdf.walk.leaps import ENDS, LEAPT_ON, NEVER, Leaps, leap, missing, patience
 from tsdf.walk.lights import LightArrays
@@ -459,7 +459,7 @@ def surface_met(g, p, d, hits, ray):
         facet = hits[ray, 0]
         facets = g.grid.facets
         t, cosine = plane_hit(facets, facet, p, d)
-        slack, n = facets[facet, 13], (facets[facet, 0], facets[facet, 1], facets[facet, 2])
+        slack, n = facets[facet, THICK], (facets[facet, 0], facets[facet, 1], facets[facet, 2])
         if t < 0.0:
             return best, which, n, slack, True
         if t < math.inf:
@@ -492,7 +492,7 @@ def boundary_met(g, m, p, d, hits, ray, known):
     facets = g.grid.facets
     t, cosine = plane_hit(facets, facet, p, d)
     n = (facets[facet, 0], facets[facet, 1], facets[facet, 2])
-    return t, cosine > 0.0, n, facets[facet, 13], t < 0.0
+    return t, cosine > 0.0, n, facets[facet, THICK], t < 0.0
 
 
 @njit(**KERNEL)
