@@ -16,7 +16,7 @@ from tsdf.judge.validate import validate
 from tsdf.reference_data import make_library
 from tsdf.reference_data.make_checks import CHECKS
 from tsdf.scene.ball import ball_of
-from tsdf.scene.scene import parse
+from tsdf.scene.scene import load, parse
 
 BALL = (Path(__file__).parent / "ball.toml").read_text()
 
@@ -68,6 +68,7 @@ def test_a_file_of_that_name_wins(tmp_path, monkeypatch):
     [
         ("suger", "suger: neither a file nor a ready table; did you mean sugar?"),
         ("Fresh-Snow", "did you mean fresh-snow?"),
+        ("fresh_snow", "did you mean fresh-snow?"),
         ("xyzzy", "ready tables are coarse-snow, fresh-snow,"),
     ],
 )
@@ -80,6 +81,9 @@ def test_unknown_names(name, message, capsys):
     with pytest.raises(SceneError) as told:
         parse(scene)
     assert message in str(told.value)
+    with pytest.raises(SceneError) as told:
+        load(name)
+    assert message in str(told.value) and "\n" not in str(told.value)
     assert not validate(name).ok
     assert status(info, name) == 1
     assert message in capsys.readouterr().err

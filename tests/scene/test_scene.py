@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tsdf.data import library
 from tsdf.errors import SceneError, UsageError
+from tsdf.picture import image
 from tsdf.scene import scene
 from tsdf.scene.scene import Absorption, load, parse
 from tsdf.scene.specs import absorption_at
@@ -468,6 +470,17 @@ def test_text_that_is_no_scene(tmp_path, content, expected):
         load(path)
     assert str(error.value).startswith(f"{path}: ") and expected in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_table_or_a_picture_is_no_scene(tmp_path):
+    """A table, of more bytes than a scene may have even, says what it is and what is done with it."""
+    table = tmp_path / "sugar.tsdf.exr"
+    table.write_bytes((library.FOLDER / "sugar.tsdf.exr").read_bytes() + bytes(10**6))
+    with pytest.raises(SceneError, match=r"is a table of grains and no scene; .* tsdf-preview, .* table = 'sugar\."):
+        load(table)
+    image.write_exr(tmp_path / "picture.exr", np.ones((2, 2, 3)), attributes={"tsdf_render": "{}"})
+    with pytest.raises(SceneError, match="is an OpenEXR picture and no scene"):
+        load(tmp_path / "picture.exr")
 
 
 def test_values_of_any_size_and_depth_are_answered(folder):

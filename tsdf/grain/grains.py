@@ -11,6 +11,7 @@ import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -159,7 +160,11 @@ def load_grain(source: str | Path, repair: bool | Literal["any"] = False, **para
         area, volume = 4 * np.pi, 4 * np.pi / 3
         return Grain("sphere", name, {}, nothing, none, 1.0, area, volume, True, 1, (), digest)
     if not os.path.exists(name):
-        raise GrainError(f"{name}: neither a file nor a built-in grain; built-in grains are {', '.join(BUILT_INS)}")
+        near = get_close_matches(name.lower(), BUILT_INS, 1)
+        hint = f"did you mean {near[0]}? " if near else ""
+        raise GrainError(
+            f"{name}: neither a file nor a built-in grain; {hint}built-in grains are {', '.join(BUILT_INS)}"
+        )
     vertices, faces = read_mesh(Path(source))
     return grain_from_mesh(vertices, faces, name=Path(source).name, repair=repair)
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from tsdf.data import format as tsdf_format
 from tsdf.data import library
+from tsdf.data.container import MAGIC
 from tsdf.data.table import Table
 from tsdf.errors import FormatError, SceneError, TSDFError, UsageError
 from tsdf.grain import constants
@@ -84,6 +85,7 @@ LEVELS = tuple(levels.LEVELS)
 VISIBLE_NM = (380.0, 780.0)  # [nm] what an absorption spectrum must cover
 SMALLEST = 1e-12  # [unit] of anything that has a size
 MAX_BYTES = 1_000_000  # of the TOML text
+HEAD_BYTES = 4096  # that hold the names of what is at the head of a table
 MAX_SIDE = 65536  # [pixel] along one side of the picture
 MAX_PICTURE = 2**25  # of the picture: two gigabytes while it is made
 MAX_SAMPLES = 2**31 - 1  # per pixel
@@ -115,17 +117,20 @@ def load(path: str | os.PathLike[str]) -> Scene:
     (0.5, 'auto')
     """
     name = os.fspath(path)
-    if name in library.names() and not os.path.exists(path):
-        return parse(ball_of(name), name=name)
     try:
+        if not os.path.exists(path) and library.ready(name):
+            return parse(ball_of(name), name=name)
         status = os.stat(path)
         if stat.S_ISDIR(status.st_mode):
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         if not stat.S_ISREG(status.st_mode):
             raise SceneError(f"{name}: is not a regular file; give the path of a TOML file")
+        _check_text(path, name)
         if status.st_size > MAX_BYTES:
             raise SceneError(f"{name}: has {status.st_size} bytes, and a scene at most {MAX_BYTES}; is it a scene?")
         data = tomllib.loads(Path(path).read_bytes().decode("utf-8-sig"))
+    except FormatError as error:  # no ready table either
+        raise SceneError(error.reason) from error
     except OSError as error:
         raise SceneError(f"{name}: cannot be read: {error.strerror or error}; give the path of a TOML file") from error
     except UnicodeDecodeError as error:
@@ -136,6 +141,17 @@ def load(path: str | os.PathLike[str]) -> Scene:
     except ValueError as error:  # a TOMLDecodeError, but also a number of 5000 digits or a zero byte in the path
         raise SceneError(f"{name}: not TOML: {error}; see https://toml.io") from error
     return parse(data, Path(path).parent, name)
+
+
+def _check_text(path: str | os.PathLike[str], name: str) -> None:
+    """Refuse tables and pictures in the place of a scene."""
+    with open(path, "rb") as file:
+        head = file.read(HEAD_BYTES)
+    if head.startswith(MAGIC) and b"tsdf\0string\0" in head:
+        way_out = f"look at it with tsdf-preview, or name it in a scene: table = {os.path.basename(name)!r}"
+        raise SceneError(f"{name}: is a table of grains and no scene; {way_out}")
+    if head.startswith(MAGIC):
+        raise SceneError(f"{name}: is an OpenEXR picture and no scene; give the path of a TOML file")
 
 
 def parse(data: Mapping[str, Any], folder: str | os.PathLike[str] = ".", name: str = "scene") -> Scene:
