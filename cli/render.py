@@ -174,7 +174,7 @@ def save(world: "World", picture: "Picture", seed: int, out: Path, chosen: dict[
     if picture.trust is not None:
         facts |= {
             "trusted": picture.trust.doubt is None,
-            "vov": picture.trust.vov,
+            "vov": picture.trust.vov if math.isfinite(picture.trust.vov) else None,
             "slope": picture.trust.slope if math.isfinite(picture.trust.slope) else None,
             "met_by_chance": 1.0 / picture.trust.chance if picture.trust.chance > 0.0 else None,
             "unsure_pixels": picture.trust.unsure,

@@ -108,6 +108,16 @@ def test_options(folder: Path) -> None:
     assert image.read_exr(folder / "O.EXR").rgb.shape == (4, 6, 3) and (folder / "O.png").is_file()
 
 
+def test_few_samples_are_not_trusted(folder: Path) -> None:
+    """One line, also when quiet, and in the file."""
+    for spp in (1, 2):
+        result = run(folder, "--width", 6, "--level", "isotropic", "--spp", spp, "--quiet")
+        assert (result.exit_code, result.stdout) == (0, "") and result.stderr.count("\n") == 1
+        assert result.stderr.startswith("warning: the error of the picture cannot be trusted: too few samples to say")
+        said = facts(folder / "p.exr")
+        assert said["trusted"] is False and said["vov"] is None and said["unsure_pixels"] > 0.0 and "slope" in said
+
+
 @pytest.mark.slow
 def test_explicit_grains(folder: Path) -> None:
     """Asked for by the command or the scene, and what was made says so; 0 is a picture without."""
