@@ -89,6 +89,32 @@ def test_unknown_names(name, message, capsys):
     assert message in capsys.readouterr().err
 
 
+def test_what_drawing_lengths_costs():
+    """Lengths drawn uniformly in their cells against the means that tables state, as schema/SPEC.md says: how much
+    longer in the mean, and how much more a grain absorbs; and the sampler does draw them so."""
+    longer, darker = {}, {}
+    for name in library.names():
+        table = tsdf.library(name)
+        masses = table.block("p_l").astype(np.float64) * table.p_theta / table.p_theta.sum()
+        mean, (low, high) = (
+            table.block("mean_l").astype(np.float64),
+            (table.edges("p_l")[i:][:124, None] for i in (0, 1)),
+        )
+        stated = float((masses * mean).sum())
+        longer[name] = float((masses * (low + high)).sum()) / 2.0 / stated - 1.0
+        for x in (0.01, 0.1, 1.0):
+            width = x * np.maximum(high - low, 1e-300)
+            drawn = 1.0 - float((masses * np.exp(-x * low) * -np.expm1(-width) / width).sum())
+            darker[name, x] = drawn / (1.0 - table.albedo(x) / table.albedo(0.0)) - 1.0
+    assert {name for name, share in longer.items() if share > 0.003} == {"quartz", "sugar"}
+    assert min(longer.values()) > 0.0001 and 0.006 < longer["sugar"] < 0.0075 and 0.023 < longer["quartz"] < 0.025
+    assert max(darker.values()) < 0.004 and max(v for (_, x), v in darker.items() if x >= 0.1) < 0.002
+    table = tsdf.library("sugar")
+    drawn = tsdf.Sampler(table).sample(np.random.default_rng(0).random((250_000, 6))).path_length
+    stated = table.header["statistics"]["mean_path_length"]
+    assert abs(drawn.mean() / stated - 1.0 - longer["sugar"]) < 4.0 * drawn.std() / 500.0 / stated
+
+
 @pytest.mark.slow
 def test_first_picture(tmp_path, monkeypatch):
     """What docs/library.md shows, small: sugar is bright and beads, of which light comes out forwards, differ."""
