@@ -24,7 +24,7 @@ from tsdf.grain.grains import first_hit
 from tsdf.picture import image
 from tsdf.picture.footprint import met_by_pixel
 from tsdf.picture.leaping import GAMMA, checked, leaping
-from tsdf.picture.media import DARKEST, media_of, spectra_of
+from tsdf.picture.media import DARKEST, media_of, notes_of, spectra_of
 from tsdf.picture.trust import MOST_VOV, kurtosis_of
 from tsdf.scene.levels import AUTO, LEVELS, Traits
 from tsdf.scene.medium import Component, VolumeParameters, free_path
@@ -307,7 +307,7 @@ def build(
     made = brim = placed(traits.placed or singles > 0)
     if not traits.placed and singles and any(medium.inside == "centres" for medium in scene.media):
         brim = placed(False)
-    notes = list(made.notes)
+    notes = [*made.notes, *notes_of(scene)]
     media, absorption, parameters = media_of(scene, traits, tables, limit)
     if records := LEVELS[level].records:
         for grain, table in zip((g for m in scene.media for g in m.grains), tables, strict=True):

@@ -61,6 +61,7 @@ from tsdf.scene.medium import MAX_PACKING_FRACTION
 from tsdf.scene.sizes import SIZES, WORDS, check_words, convert
 from tsdf.scene.specs import (
     INSIDE,
+    KNOWN_NM,
     UP,
     Absorption,
     Box,
@@ -82,7 +83,6 @@ from tsdf.scene.specs import (
 )
 
 LEVELS = tuple(levels.LEVELS)
-VISIBLE_NM = (380.0, 780.0)  # [nm] what an absorption spectrum must cover
 SMALLEST = 1e-12  # [unit] of anything that has a size
 MAX_BYTES = 1_000_000  # of the TOML text
 HEAD_BYTES = 4096  # that hold the names of what is at the head of a table
@@ -197,7 +197,7 @@ def absorbing_material(name: str, folder: str | os.PathLike[str] = ".") -> str |
     Raises
     ------
     UsageError, TSDFError
-        In one line, for what is neither, and for constants that do not say how light is absorbed from 380 to 780 nm.
+        In one line, for what is neither, and for constants that do not say how light is absorbed from 400 to 700 nm.
     """
     path = Path(folder) / name
     if name in ABSORBING:
@@ -209,9 +209,10 @@ def absorbing_material(name: str, folder: str | os.PathLike[str] = ".") -> str |
             "wavelength_nm,n,k or .yml of refractiveindex.info)"
         )
     medium, (low, high) = constants.read(path)
-    if medium.k is None or low > VISIBLE_NM[0] or high < VISIBLE_NM[1]:
+    if medium.k is None or low > KNOWN_NM[0] or high < KNOWN_NM[1]:
         known = "does not say k" if medium.k is None else f"says k from {low:g} to {high:g} nm only"
-        raise TSDFError(f"{path}: {known}; absorption needs it from {VISIBLE_NM[0]:g} to {VISIBLE_NM[1]:g} nm")
+        way_out = f"absorption needs it from {KNOWN_NM[0]:g} to {KNOWN_NM[1]:g} nm: add lines for the rest"
+        raise TSDFError(f"{path}: {known}; {way_out}")
     return path
 
 
@@ -251,10 +252,10 @@ def _absorption(value: Any, key: str, at: Place) -> Absorption:
         at.fail(f"wavelength_nm and coefficient must be of one length, not {len(nm)} and {len(sigma_a)}")
     if any(a >= b for a, b in pairwise(nm)):
         at.fail("wavelength_nm must ascend")
-    low, high = VISIBLE_NM
+    low, high = KNOWN_NM
     if not nm or nm[0] > low or nm[-1] < high:
         covered = f"not only {nm[0]:g} to {nm[-1]:g}" if nm else "not nothing"
-        at.fail(f"wavelength_nm must cover {low:g} to {high:g} nm, {covered}")
+        at.fail(f"wavelength_nm must cover {low:g} to {high:g} nm, {covered}; add values for the rest")
     return Absorption("spectral", sigma_a, nm)
 
 
