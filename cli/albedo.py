@@ -50,8 +50,9 @@ def main(  # noqa: PLR0913 - an argument for each option
     """Tell what a slab or half-space of GRAIN does to light by wavelength: reflectance, transmittance, absorption.
 
     GRAIN is as of tsdf-build, or tables of one grain at several indices. All wavelengths are read off the same paths,
-    followed at up to three refractive indices. Beside them: two streams (delta-Eddington) and asymptotic theory, from
-    the same albedo, g and B. `between` is what n between the indices may miss.
+    followed at up to three refractive indices. Beside them, from the same single scattering: doubling, which is level
+    volume without noise, two streams (delta-Eddington) and asymptotic theory. `between` is what n between the indices
+    may miss.
     """
     asked = spectral.Asked.of(grains, said)
     check_numbers(seed, said["threads"], paths=paths)

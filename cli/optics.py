@@ -71,7 +71,7 @@ def main(
     ]
     notes = [plain(note) for note in notes]
     if phase is not None:
-        edges, masses = family.masses(c.n, np.nan_to_num(found.absorption_times_radius))
+        edges, masses = family.masses(found)
         with replacing(phase) as temporary:
             temporary.write_text(phase_text(edges, masses, spectra.wavelength_heads(c), notes[:1]), "utf-8")
     if moments is not None:

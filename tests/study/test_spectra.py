@@ -83,7 +83,7 @@ def test_moments_between_tables_are_no_clipped_polynomials(ice: Constants, famil
     the phase functions for reading are nowhere negative."""
     moments, _ = spectra.moments_of(family, found, 1)
     assert moments[:, 1] == pytest.approx(found.g, abs=2e-4)
-    _, masses = family.masses(ice.n, found.absorption_times_radius)
+    _, masses = family.masses(found)
     assert masses.min() >= 0.0 and masses.sum(axis=1) == pytest.approx(np.ones(len(ice.n)))
 
 
@@ -104,22 +104,6 @@ def test_k_that_is_not_known_is_no_absorption_of_zero() -> None:
     found = spectra.spectrum(Family(found_tables(1.55)), quartz, RADIUS)
     assert np.isnan(found.albedo).all() and np.isfinite(found.g).all()
     assert any("k of quartz is not known at 2 of 2" in note for note in found.notes)
-
-
-def test_dark_surfaces_are_told() -> None:
-    """At 3 um ice reflects by its k as well, which tables leave out: the error of the albedo has the difference."""
-    ice = Constants.of(constants_over("ice", [3100.0]))
-    found = spectra.spectrum(Family(found_tables(float(ice.n[0]))), ice, RADIUS)
-    whole = spectra.diffuse_reflectance(ice.n, ice.k)[0]
-    assert abs(found.albedo[0] - whole) <= found.error("albedo")[0] + 1e-4
-    assert abs(found.albedo[0] - whole) > 1e-3
-    assert "changes the reflectance of the surface" in found.notes[0]
-    # of a mirror, and of a clear surface by its own formula
-    assert spectra.diffuse_reflectance(np.array([1e-3]), np.array([1e4]))[0] > 0.99
-    angles = np.cos(np.linspace(0.0, np.pi / 2.0, 20_001))
-    s, p = analytic.fresnel_reflectance(angles, 1.31)
-    mean = np.trapezoid((0.5 * (s + p) * 2.0 * angles)[::-1], angles[::-1])
-    assert spectra.diffuse_reflectance(np.array([1.31]), np.array([0.0]))[0] == pytest.approx(mean, abs=1e-5)
 
 
 @pytest.mark.parametrize(
