@@ -165,6 +165,8 @@ def load_grain(source: str | Path, repair: bool | Literal["any"] = False, **para
         raise GrainError(
             f"{name}: neither a file nor a built-in grain; {hint}built-in grains are {', '.join(BUILT_INS)}"
         )
+    if name.lower().endswith(".toml"):
+        raise GrainError(f"{name}: is a scene, which tsdf-render and tsdf-plan take; name a grain")
     vertices, faces = read_mesh(Path(source))
     return grain_from_mesh(vertices, faces, name=Path(source).name, repair=repair)
 
