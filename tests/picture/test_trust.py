@@ -105,6 +105,8 @@ def test_one_or_two_samples_of_a_pixel_are_too_few_to_say(n: int) -> None:
     part.add(slice(0, PIXELS), np.zeros(PIXELS, np.int64), np.repeat(values[..., None], 3, axis=2))
     samples = np.where(np.arange(PIXELS) < PIXELS - 1, 3, n)
     assert part.trust(samples, (1, PIXELS), 0.0).vov == math.inf
+    blind = part.trust(samples, (1, PIXELS), 1e6)  # of a sun that has not been met more is to be said
+    assert trust.few and not blind.few and "suns" in str(blind.doubt)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
@@ -117,6 +119,7 @@ def test_without_noise_any_number_of_samples_does(n: int) -> None:
     begun = Moments(2)
     begun.add(slice(0, 1), np.zeros(2, np.int64)[:1], np.ones((1, 1, 3)))
     assert begun.trust(np.array([1, 0]), (1, 2), 0.0).doubt is not None
+    assert (gathered(np.ones((1, n))).doubt is None) == (n > 1)  # a single sample of all
 
 
 @pytest.mark.parametrize("n", [3, 4, 8, 30, 300])

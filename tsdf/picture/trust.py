@@ -51,6 +51,11 @@ class Trust:
         return float((self.pixels > MOST_VOV).mean())
 
     @property
+    def few(self) -> bool:
+        """Whether all that is to be said is that samples are too few to say."""
+        return math.isinf(self.vov) and not self.chance > MOST_VOV
+
+    @property
     def doubt(self) -> str | None:
         """Why the error bar of the picture cannot be trusted, in one line; None if it can."""
         if self.chance > MOST_VOV:
@@ -59,7 +64,7 @@ class Trust:
                 f"suns or small bright lights are met by chance alone, about {met:.2g} times in all samples; widen "
                 "them by a smooth sky, or take a level that aims at them"
             )
-        elif math.isinf(self.vov):
+        elif self.few:
             why = f"too few samples to say, fewer than {ENOUGH} in a pixel; take more"
         elif self.vov > MOST_VOV:
             why = (
@@ -148,9 +153,9 @@ class Moments:
 
 
 def _alike(values: np.ndarray) -> bool:
-    """Return whether pixels show the same light but for rounding, as in a furnace."""
+    """Return whether all of several pixels show the same light but for rounding, as in a furnace."""
     least, most = float(values.min()), float(values.max())
-    return most - least <= SAME * most and most > 0.0
+    return len(values) > 1 and most > 0.0 and most - least <= SAME * most
 
 
 def kurtosis_of(lights: LightArrays) -> float:
