@@ -157,6 +157,29 @@ def test_the_same_for_any_number_of_threads(family: Family, found: Spectrum) -> 
 
 
 @pytest.mark.slow
+def test_what_is_stopped_tells_what_it_has_with_its_error(family: Family, found: Spectrum) -> None:
+    """Not before each set has its first paths; then in the middle of a set, so that one has more of them than another,
+    what is told is that slab by doubling, within errors that are those of so few paths."""
+    request = Request("volume", FRACTION, 10.0, 0.7)
+    first = slabs.measure(family, found, request, 1e-5, threads=2, goes_on=lambda paths: False)
+    whole = slabs.measure(family, found, request, threads=2, paths=slabs.FEWEST)
+    assert first.paths == slabs.FEWEST and np.array_equal(first.reflectance, whole.reflectance)
+    heard: list[int] = []
+
+    def goes_on(paths: int) -> bool:
+        heard.append(paths)
+        return heard.count(slabs.FEWEST) < 8
+
+    some = slabs.measure(family, found, request, 1e-5, threads=2, goes_on=goes_on)
+    assert some.paths == slabs.FEWEST and set(heard) == {slabs.FEWEST}
+    assert not np.array_equal(some.reflectance, whole.reflectance)
+    for got in (first, some):
+        off = np.abs(np.stack([got.reflectance, got.transmittance]) - np.stack(got.theories.doubled))
+        error = np.stack([got.reflectance_error, got.transmittance_error])
+        assert (off < SIGMAS * error + 5e-4).all() and error[:, 2].min() > 1e-3 and error.max() < 5e-3
+
+
+@pytest.mark.slow
 def test_thinned_paths_are_unbiased(family: Family, found: Spectrum, monkeypatch: pytest.MonkeyPatch) -> None:
     """Long paths thinned, as with a profile, against paths that are all followed to their end, and against leaps: the
     same, but noisier where light comes back nearly whole. A share that is not made up for would take a tenth of it."""

@@ -121,6 +121,13 @@ def test_wavelengths_that_are_none(text: str) -> None:
         spectra.wavelengths(text)
 
 
+def test_wavelengths_that_fall() -> None:
+    for text in ("5000:200:-1000", "5000:200:1000", "200:5000:-10", "200:5000:0"):
+        with pytest.raises(UsageError, match="FROM:TO:STEP rises"):
+            spectra.wavelengths(text)
+    assert spectra.wavelengths("300:300:10").tolist() == [300.0]
+
+
 @pytest.mark.slow
 def test_tables_that_make_no_family(ice: Constants) -> None:
     ball = found_tables(1.3, 1.31)
@@ -129,6 +136,9 @@ def test_tables_that_make_no_family(ice: Constants) -> None:
     build.run(cube)
     with pytest.raises(UsageError, match="different grains"):
         Family.of([*ball, build.table()])
+    apart = scatterometer.exact_sphere(load_grain("sphere"), Optics(1.32, "sp"), Effort())
+    with pytest.raises(UsageError, match="--fresnel sp and --fresnel un"):
+        Family.of([*ball, apart])
     with pytest.raises(UsageError, match="the same index"):
         Family.of([ball[0], ball[0]])
     with pytest.raises(UsageError, match="add tables at the ends"):

@@ -35,6 +35,7 @@ from tsdf.walk import transport
 GROUPS = 32  # of paths, whose spread tells the error
 CHUNK = 4096  # paths that one thread follows at a time
 FEWEST, MOST = 1 << 14, 1 << 24  # paths of a set
+SPREAD = 0.4  # of what a path gives: a guess for how many it takes, before any is followed
 DEEP = 30.0  # decay lengths of the least absorbed light from which on a slab is a half-space
 FEEBLE = 1e-9  # co-albedo below which a half-space cannot be told from one that absorbs nothing
 CLEAR = 5.0  # [R] above the slab where light starts
@@ -389,6 +390,7 @@ def measure(
     threads: int | None = None,
     paths: int | None = None,
     told: Callable[[float, str], None] = lambda share, word: None,
+    goes_on: Callable[[int], bool] = lambda paths: True,
 ) -> Albedo:
     """Return what a slab does to light at the wavelengths of a spectrum.
 
@@ -408,6 +410,9 @@ def measure(
         Of each set, instead of a target.
     told : callable
         Called with the share done, in [0, 1], and a word about it.
+    goes_on : callable
+        Called now and then with the number of paths that each set has had at least; tells whether to follow more. It is
+        not heeded as long as that is 0.
 
     Raises
     ------
@@ -454,13 +459,20 @@ def measure(
 
     threads = threads or os.cpu_count() or 1
     done, following = 0, min(paths, FEWEST) if paths else FEWEST
+    wanted, on = paths or max(following, int((SPREAD / target) ** 2)), True
     with ThreadPoolExecutor(threads) as pool:
-        while following:
-            for number, one in enumerate(flat):
-                for share in one.more(following, seed, pool):
-                    within = (number + share) / len(flat)
-                    told((done + within * following) / max(paths or done + following, 1), f"{done + following} paths")
-            done += following
+        while following and on:
+            steps = (
+                (number + share) / len(flat) for number, one in enumerate(flat)
+                for share in one.more(following, seed, pool)
+            )  # fmt: skip
+            for within in steps:
+                told(min((done + within * following) / wanted, 1.0), f"{done + following} of about {wanted} paths")
+                if done and not goes_on(done):
+                    break
+            steps.close()  # jobs that are not begun are not done
+            done = min(int(one.count.sum()) for one in flat)
+            on = goes_on(done)
             spread = [result(group)[0] for group in range(GROUPS)]
             error = _jackknife(spread)
             if paths:
@@ -469,6 +481,7 @@ def measure(
                 needed = min(done * (float(error.max()) / target) ** 2 * 1.05, MOST)
                 following = max(0, min(int(needed) - done, 8 * done)) if error.max() > target else 0
                 following = -(-following // GROUPS) * GROUPS
+                wanted = max(int(needed), done)
     whole, profile = result()
     profile_error = _jackknife([result(group)[1] for group in range(GROUPS)]) if request.depths else profile
     error += found.surface.unsure * np.abs(theories.surface)
@@ -488,7 +501,7 @@ class Theories(NamedTuple):
     """What theories say of a slab: from the same optical depth, albedo and g; `doubled` from the whole phase function.
 
     `between` is how far off two streams would be between the tables that paths are followed at; `surface` what k makes
-    of the surface, which paths do not know, by doubling.
+    of the surface, which paths do not know, by doubling; `optical_depth` that of the slab, (w,) float64.
     """
 
     two_streams: streams.Streams
@@ -496,6 +509,7 @@ class Theories(NamedTuple):
     doubled: streams.Streams
     between: np.ndarray
     surface: streams.Streams
+    optical_depth: np.ndarray
 
 
 def _theories(family: Family, found: Spectrum, request: Request, which: list[int]) -> Theories:
@@ -541,6 +555,7 @@ def _theories(family: Family, found: Spectrum, request: Request, which: list[int
     return Theories(
         eddington(depth(found.albedo), found.albedo, found.g),
         streams.Streams(*(np.where(thick, values, math.nan) for values in simple)), exact, between, surface,
+        depth(found.albedo),
     )  # fmt: skip
 
 
@@ -553,7 +568,7 @@ def records_of(level: str) -> str | None:
 def columns(result: Albedo, found: Spectrum) -> dict[str, np.ndarray]:
     """Return what a slab does as named columns; layers of the profile by number, from above."""
     sheet = {
-        "wavelength_nm": found.constants.wavelength_nm,
+        "wavelength_nm": found.constants.wavelength_nm, "optical_depth": result.theories.optical_depth,
         "reflectance": result.reflectance, "reflectance_error": result.reflectance_error,
         "between": result.theories.between,
         "transmittance": result.transmittance, "transmittance_error": result.transmittance_error,

@@ -48,6 +48,8 @@ def wavelengths(text: str) -> np.ndarray:
         raise wrong("not numbers") from None
     found: list[float] = []
     for span in numbers:
+        if len(span) == 3 and (span[0] > span[1] or span[2] <= 0.0):
+            raise wrong("FROM:TO:STEP rises, FROM to TO by a STEP above 0")
         if not all(0.0 < number < 1e9 for number in span):
             raise wrong("each is above 0 and finite")
         if len(span) == 1:
@@ -121,7 +123,7 @@ class Family:
     Raises
     ------
     UsageError
-        If they are of several grains, or two of them have the same index.
+        If they are of several grains or conventions of Fresnel, or two of them have the same index.
     """
 
     tables: tuple[Table, ...]
@@ -133,6 +135,8 @@ class Family:
 
         if any(shape(table) != shape(self.tables[0]) for table in self.tables):
             raise UsageError("the tables are of different grains: give tables of one grain at several indices")
+        if len({str(table.header["optics"]["fresnel"]) for table in self.tables}) > 1:
+            raise UsageError("the tables are made with --fresnel sp and --fresnel un: give tables of one of them")
         if (np.diff(self.eta) <= SAME).any():
             raise UsageError("two of the tables have the same index: give each once")
 
