@@ -118,7 +118,7 @@ def test_rings_of_a_lathe_are_meant(digits):
     ],
 )
 def test_tilt_is_that_of_the_facets(mesh, step, axes):
-    """What is said of rounding, of all axes or one, is the angle between facets before and after, within a fifth."""
+    """What is said of rounding, of all axes or one, is the angle between facets before and after, within a quarter."""
     points, faces = np.asarray(mesh[0], np.float64), np.asarray(mesh[1], np.int64)
     rounded = on_grid(points, step, axes)
     tilt, true = tilt_of(rounded, faces), angle_between(points, rounded, faces)
