@@ -300,14 +300,14 @@ class Progress:
             minutes, seconds = divmod(int(now - self._begun), 60)
             click.echo(f"{100.0 * self._share:.0f} %, {word} [{minutes}:{seconds:02d}]", err=True)
 
-    def note(self, text: str) -> None:
-        """Write a line above the bar."""
-        if self._quiet:
+    def note(self, text: str, kind: str = "note") -> None:
+        """Write a line above the bar; of a quiet command only warnings."""
+        if self._quiet and kind == "note":
             return
         with contextlib.suppress(OSError, ValueError):
             if self._bar is not None:
                 self._bar.clear()
-            click.echo(f"note: {plain(text)}", err=True)
+            click.echo(f"{kind}: {plain(text)}", err=True)
 
     def close(self) -> None:
         """Leave the bar as it is."""

@@ -81,7 +81,7 @@ def first_grains(
     "[default: the scene's, else 2]",
 )  # fmt: skip
 @threads_option
-@click.option("--quiet", is_flag=True, help="No progress bar, no summary.")
+@click.option("--quiet", is_flag=True, help="No progress bar, no notes, no summary; warnings stay.")
 def main(
     scene: Path, out: Path, level: str | None, explicit_grains: tuple[int, bool] | None, spp: int | None,
     seconds: float | None, target_error: float | None, seed: int | None, width: int | None, leap: float | None,
@@ -131,15 +131,14 @@ def main(
         choice = shot.chosen(read, level, spp, seconds, target_error, seed, threads, work.progress)
         made = choice.world(leap, work.progress)
         for note in (*(report.notes(choice.plan) if choice.plan else ()), *made.notes):
-            work.progress.note(note)
+            work.progress.note(note, "warning" if note in made.warnings else "note")
         work.progress(0.0, "starting")
         picture = render.render(made, choice.spp, choice.left, choice.target_error, seed, threads, told, work.stop)
         if not picture.samples.any():
             click.echo("interrupted before the first sample: nothing is written", err=True)
             return interrupt_status()
         save(made, picture, seed, out, report.chosen_facts(choice.plan) if choice.plan else None)
-    if picture.trust is not None and picture.trust.doubt is not None:
-        click.echo(f"warning: {picture.trust.doubt}", err=True)
+    warn(picture)
     if not quiet or picture.interrupted:
         summary(made, picture, out)
         if choice.plan is not None and choice.plan.chosen.floor.value > picture.relative_error:
@@ -174,7 +173,7 @@ def save(world: "World", picture: "Picture", seed: int, out: Path, chosen: dict[
     if picture.trust is not None:
         facts |= {
             "trusted": picture.trust.doubt is None,
-            "vov": picture.trust.vov,
+            "vov": picture.trust.vov if math.isfinite(picture.trust.vov) else None,
             "slope": picture.trust.slope if math.isfinite(picture.trust.slope) else None,
             "met_by_chance": 1.0 / picture.trust.chance if picture.trust.chance > 0.0 else None,
             "unsure_pixels": picture.trust.unsure,
@@ -199,6 +198,12 @@ def summary(world: "World", picture: "Picture", out: Path) -> None:
         say(f"{plain(out)}: {dots}{fewer_dots(world)}")
     for line in media(world):
         say(line)
+
+
+def warn(picture: "Picture") -> None:
+    """Say on standard error what is wrong with a picture, however quiet the command is to be."""
+    if picture.trust is not None and picture.trust.doubt is not None:
+        click.echo(f"warning: {picture.trust.doubt}", err=True)
     lost = picture.truncated + picture.faults
     if lost:
         faults = f"{picture.faults} of them at a fault of a mesh"

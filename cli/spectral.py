@@ -100,11 +100,24 @@ def options(command: Command) -> Command:
 
 
 def is_table(name: str) -> bool:
-    """Whether a name stands for a table, by its ending or as a ready one's, and not for a grain."""
-    from tsdf.data.library import names
+    """Whether a name stands for a table, by its ending or as a ready one's, and not for a grain.
+
+    Raises
+    ------
+    FormatError
+        It stands for neither, and the nearest name is that of a ready table.
+    """
+    from difflib import get_close_matches
+
+    from tsdf.data.library import names, ready
     from tsdf.grain.grains import BUILT_INS
 
-    return name.lower().endswith(SUFFIX) or (name in names() and name not in BUILT_INS and not Path(name).exists())
+    if name.lower().endswith(SUFFIX):
+        return True
+    if name in BUILT_INS or os.path.exists(name):
+        return False
+    near = get_close_matches(name.lower(), [*BUILT_INS, *names()], 1)
+    return bool(near) and near[0] not in BUILT_INS and ready(name) is not None
 
 
 def own_material(tables: Sequence[str]) -> str:

@@ -44,6 +44,9 @@ def test_what_was_mended_is_said_by_the_world(tmp_path):
     pixels = np.full((4, 8, 3), 0.25)
     pixels[1, 4, 0] = -1e-7
     made = looking(tmp_path, pixels)
-    assert sum("sky.exr: 1 pixel is negative" in note for note in made.notes) == 1
+    assert sum("sky.exr: 1 pixel is negative" in note for note in made.notes) == 1 and not made.warnings
     assert render.render(made, spp=1).rgb.min() == 0.0
     assert not looking(tmp_path, np.abs(pixels)).notes
+    pixels[1, 4, 0] = np.nan
+    (warning,) = looking(tmp_path, pixels).warnings
+    assert "sky.exr: 1 pixel is not a number: taken as 0" in warning

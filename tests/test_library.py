@@ -16,7 +16,7 @@ from tsdf.judge.validate import validate
 from tsdf.reference_data import make_library
 from tsdf.reference_data.make_checks import CHECKS
 from tsdf.scene.ball import ball_of
-from tsdf.scene.scene import parse
+from tsdf.scene.scene import load, parse
 
 BALL = (Path(__file__).parent / "ball.toml").read_text()
 
@@ -68,6 +68,7 @@ def test_a_file_of_that_name_wins(tmp_path, monkeypatch):
     [
         ("suger", "suger: neither a file nor a ready table; did you mean sugar?"),
         ("Fresh-Snow", "did you mean fresh-snow?"),
+        ("fresh_snow", "did you mean fresh-snow?"),
         ("xyzzy", "ready tables are coarse-snow, fresh-snow,"),
     ],
 )
@@ -80,9 +81,38 @@ def test_unknown_names(name, message, capsys):
     with pytest.raises(SceneError) as told:
         parse(scene)
     assert message in str(told.value)
+    with pytest.raises(SceneError) as told:
+        load(name)
+    assert message in str(told.value) and "\n" not in str(told.value)
     assert not validate(name).ok
     assert status(info, name) == 1
     assert message in capsys.readouterr().err
+
+
+def test_what_drawing_lengths_costs():
+    """Lengths drawn uniformly in their cells against the means that tables state, as schema/SPEC.md says: how much
+    longer in the mean, and how much more a grain absorbs; and the sampler does draw them so."""
+    longer, darker = {}, {}
+    for name in library.names():
+        table = tsdf.library(name)
+        masses = table.block("p_l").astype(np.float64) * table.p_theta / table.p_theta.sum()
+        mean, (low, high) = (
+            table.block("mean_l").astype(np.float64),
+            (table.edges("p_l")[i:][:124, None] for i in (0, 1)),
+        )
+        stated = float((masses * mean).sum())
+        longer[name] = float((masses * (low + high)).sum()) / 2.0 / stated - 1.0
+        for x in (0.01, 0.1, 1.0):
+            width = x * np.maximum(high - low, 1e-300)
+            drawn = 1.0 - float((masses * np.exp(-x * low) * -np.expm1(-width) / width).sum())
+            darker[name, x] = drawn / (1.0 - table.albedo(x) / table.albedo(0.0)) - 1.0
+    assert {name for name, share in longer.items() if share > 0.003} == {"quartz", "sugar"}
+    assert min(longer.values()) > 0.0001 and 0.006 < longer["sugar"] < 0.0075 and 0.023 < longer["quartz"] < 0.025
+    assert max(darker.values()) < 0.004 and max(v for (_, x), v in darker.items() if x >= 0.1) < 0.002
+    table = tsdf.library("sugar")
+    drawn = tsdf.Sampler(table).sample(np.random.default_rng(0).random((250_000, 6))).path_length
+    stated = table.header["statistics"]["mean_path_length"]
+    assert abs(drawn.mean() / stated - 1.0 - longer["sugar"]) < 4.0 * drawn.std() / 500.0 / stated
 
 
 @pytest.mark.slow

@@ -331,6 +331,8 @@ def test_bad_files(command, tmp_path, monkeypatch):
     (tmp_path / "text.tsdf.exr").write_text("not an image")
     fails(run(command, "missing.tsdf.exr", *options), 1, "missing.tsdf.exr", "FILE_UNREADABLE")
     fails(run(command, "text.tsdf.exr", *options), 1, "text.tsdf.exr", "EXR_MAGIC")
+    (tmp_path / "scene.toml").write_text("[camera]")
+    fails(run(command, "scene.toml", *options), 1, "EXR_MAGIC", "but a scene, which tsdf-render and tsdf-plan take")
     fails(run(command, ".", *options), 1, "FILE_UNREADABLE")
     fails(run(command, "--frob"), 2, "--frob", "--help")
     fails(run(command), 2, "FILE")

@@ -108,6 +108,39 @@ def test_options(folder: Path) -> None:
     assert image.read_exr(folder / "O.EXR").rgb.shape == (4, 6, 3) and (folder / "O.png").is_file()
 
 
+def test_few_samples_are_not_trusted(folder: Path) -> None:
+    """One line, also when quiet, and in the file."""
+    for spp in (1, 2):
+        result = run(folder, "--width", 6, "--level", "isotropic", "--spp", spp, "--quiet")
+        assert (result.exit_code, result.stdout) == (0, "") and result.stderr.count("\n") == 1
+        assert result.stderr.startswith("warning: the error of the picture cannot be trusted: too few samples to say")
+        said = facts(folder / "p.exr")
+        assert said["trusted"] is False and said["vov"] is None and said["unsure_pixels"] > 0.0 and "slope" in said
+
+
+def test_warnings_are_said_quietly_too(folder: Path) -> None:
+    """An environment that was mended, and a medium in which no grain fits: not what was asked for. Notes are not."""
+    pixels = np.full((4, 8, 3), 0.25)
+    pixels[1, 4, 0] = np.nan
+    image.write_exr(folder / "sky.exr", pixels)
+    lit = SCENE.replace('type = "constant"\nradiance = [1.0, 0.5, 0.25]', 'type = "environment"\nfile = "sky.exr"')
+    assert lit != SCENE
+    (folder / "lit.toml").write_text(lit)
+    (folder / "large.toml").write_text(SCENE.replace("radius = 0.05", "radius = 3.0"))
+    for name, words, said in (
+        ("lit", ("--level", "isotropic"), "sky.exr: 1 pixel is not a number: taken as 0"),
+        ("large", ("--level", "teleport"), "does not fit into the medium"),
+    ):
+        arguments = [str(folder / f"{name}.toml"), "--out", str(folder / "w.exr"), "--spp", "16", "--quiet", *words]
+        result = CliRunner().invoke(main, arguments)
+        assert (result.exit_code, result.stdout) == (0, "") and said in result.stderr, result.output
+        assert all(line.startswith("warning: ") for line in result.stderr.splitlines())
+    image.write_exr(folder / "sky.exr", np.full((4, 5, 3), 0.25))  # no panorama: a note
+    arguments = [str(folder / "lit.toml"), "--out", str(folder / "w.exr"), "--spp", "16", "--level", "isotropic"]
+    assert CliRunner().invoke(main, [*arguments, "--quiet"]).stderr == ""
+    assert "note: " in CliRunner().invoke(main, arguments).stderr
+
+
 @pytest.mark.slow
 def test_explicit_grains(folder: Path) -> None:
     """Asked for by the command or the scene, and what was made says so; 0 is a picture without."""

@@ -99,6 +99,7 @@ def test_albedo_says_what_was_asked(tmp_path: Path) -> None:
         (("sphere", "--csv", "-", "--json"), 2, "--csv - and --json both go to standard output"),
         (("no-such.tsdf.exr",), 1, "no-such.tsdf.exr"),
         (("no-such-grain",), 1, "neither a file nor a built-in grain"),
+        (("hexprsm",), 1, "did you mean hexprism?"), (("sugr",), 1, "ready table; did you mean sugar?"),
     ],
 )  # fmt: skip
 def test_what_both_refuse(command: object, arguments: tuple[object, ...], status: int, said: str) -> None:

@@ -300,6 +300,11 @@ def test_missing_and_directory(tmp_path):
     with pytest.raises(GrainError, match="neither a file nor a built-in grain") as error:
         load_grain(tmp_path / "cubes")
     assert all(name in str(error.value) for name in BUILT_INS)
+    with pytest.raises(GrainError, match=r"grain; did you mean hexprism\? built-in"):
+        load_grain("hex_prism")
+    (tmp_path / "scene.toml").write_text("[camera]")
+    with pytest.raises(GrainError, match="is a scene, which tsdf-render and tsdf-plan take"):
+        load_grain(tmp_path / "scene.toml")
     with pytest.raises(GrainError, match="is a directory"):
         load_grain(tmp_path)
     with pytest.raises(GrainError):

@@ -315,6 +315,7 @@ def test_pixels_that_are_no_radiance_are_mended(tmp_path, change, dtype, mended,
     assert (~good).any() and (sky.radiance[~good] == mended).all()
     (note,) = sky.notes
     assert note.startswith(f"{path}: {says}") and "\n" not in note
+    assert sky.warnings == (() if "-1e-07" in says else (note,))  # the overshoot of a filter
 
 
 def test_how_much_is_negative_is_said(tmp_path):
@@ -330,10 +331,20 @@ def test_how_much_is_negative_is_said(tmp_path):
     assert sky.notes[0].endswith("1 pixel is infinite: taken as 1e+06") and sky.radiance[1, 0, 0] == 1e6
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
-def test_black_environment_is_refused(tmp_path, value):
-    write_exr(tmp_path / "sky.exr", np.full((4, 8, 3), value))
-    with pytest.raises(TSDFError, match="every pixel is black"):
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ([0.0], "black"),
+        ([-1.0], r"negative \(32 pixels\)"),
+        ([np.nan], r"not a number \(32 pixels\)"),
+        ([0.0, -1.0], r"black or negative \(16 pixels\)"),
+        ([0.0, -np.inf, np.nan, np.nan], r"black or negative \(8 pixels\) or not a number \(16 pixels\)"),
+    ],
+)
+def test_an_environment_without_light_is_refused(tmp_path, values, said):
+    pixels = np.repeat(np.resize(values, 32)[:, None], 3, axis=1).reshape(4, 8, 3)
+    write_exr(tmp_path / "sky.exr", pixels)
+    with pytest.raises(TSDFError, match=f"every pixel is {said}, so it lights nothing"):
         read_environment(tmp_path / "sky.exr")
 
 

@@ -49,6 +49,7 @@ def test_moments_are_those_of_all_samples() -> None:
     assert trust.pixels.shape == (6, 10) and trust.pixels[0, 7] == 0.0
     rest = np.delete(np.arange(PIXELS), 7)
     expected = (away**4).sum(axis=1)[rest] / (away**2).sum(axis=1)[rest] ** 2 - 1.0 / 73.0
+    expected *= 73.0 * 72.0 / 71.0**2
     assert np.allclose(trust.pixels.ravel()[rest], expected, rtol=1e-8)
 
 
@@ -88,10 +89,44 @@ def test_one_bright_sample_is_doubted() -> None:
     assert trust.pixels[0, 11] > 0.9 and trust.unsure == 1.0 / PIXELS
 
 
-def test_few_samples_say_nothing() -> None:
-    """Pictures without noise, and too few samples for a slope, are not doubted; `doubt` is one line."""
-    assert gathered(np.ones((PIXELS, 5))).doubt is None
+def test_few_samples_have_no_slope() -> None:
     assert gathered(np.random.default_rng(3).random((4, 4))).slope == math.inf
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_one_or_two_samples_of_a_pixel_are_too_few_to_say(n: int) -> None:
+    """However even they look: of two, each makes half of the variance. From three on they tell."""
+    values = np.random.default_rng(4).random((PIXELS, 3))
+    trust = gathered(values[:, :n])
+    assert trust.vov == math.inf and trust.unsure == 1.0
+    assert trust.doubt is not None and "too few samples to say" in trust.doubt and "\n" not in trust.doubt
+    assert gathered(values).doubt is None and gathered(values).vov < 0.1
+    part = Moments(PIXELS)  # an interrupted pass
+    part.add(slice(0, PIXELS), np.zeros(PIXELS, np.int64), np.repeat(values[..., None], 3, axis=2))
+    samples = np.where(np.arange(PIXELS) < PIXELS - 1, 3, n)
+    assert part.trust(samples, (1, PIXELS), 0.0).vov == math.inf
+    blind = part.trust(samples, (1, PIXELS), 1e6)  # of a sun that has not been met more is to be said
+    assert trust.few and not blind.few and "suns" in str(blind.doubt)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+def test_without_noise_any_number_of_samples_does(n: int) -> None:
+    """A furnace, rounding included; not a picture that is black so far, nor one of which a pixel has no sample."""
+    values = 0.3 * (1.0 + 1e-15 * np.random.default_rng(5).random((PIXELS, n)))
+    trust = gathered(values)
+    assert trust.doubt is None and trust.unsure == 0.0
+    assert (gathered(0.0 * values).doubt is None) == (n > 1)
+    begun = Moments(2)
+    begun.add(slice(0, 1), np.zeros(2, np.int64)[:1], np.ones((1, 1, 3)))
+    assert begun.trust(np.array([1, 0]), (1, 2), 0.0).doubt is not None
+    assert (gathered(np.ones((1, n))).doubt is None) == (n > 1)  # a single sample of all
+
+
+@pytest.mark.parametrize("n", [3, 4, 8, 30, 300])
+def test_one_sample_that_makes_it_all_is_told_of_any_number(n: int) -> None:
+    values = np.zeros((PIXELS, n))
+    values[11, n // 2] = 1.0
+    assert gathered(values).vov == pytest.approx(1.0) and gathered(values).pixels[0, 11] == pytest.approx(1.0)
 
 
 def test_kurtosis_of_a_sun_is_one_over_its_share_of_the_sphere() -> None:
@@ -160,7 +195,8 @@ def test_a_target_error_waits_for_suns_that_only_chance_finds(table: Table) -> N
 def test_trust_is_the_same_for_any_threads(table: Table) -> None:
     found = [picture(table, "teleport", 5.0, 20, threads).trust for threads in (1, 2, 3)]
     assert len({(t.vov, t.slope, t.chance, t.pixels.tobytes()) for t in found if t is not None}) == 1
-    assert picture(table, "teleport", 5.0, 1).trust is None
+    single = picture(table, "teleport", 5.0, 1).trust
+    assert single is not None and single.doubt is not None and "too few" in single.doubt
 
 
 def test_a_pixel_of_one_sample_has_a_variance() -> None:

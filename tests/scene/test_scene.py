@@ -9,10 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tsdf.data import library
 from tsdf.errors import SceneError, UsageError
+from tsdf.picture import image
+from tsdf.picture.media import BEYOND, notes_of
 from tsdf.scene import scene
 from tsdf.scene.scene import Absorption, load, parse
-from tsdf.scene.specs import absorption_at
+from tsdf.scene.specs import VISIBLE_NM, absorption_at, held
+from tsdf.walk.lights import LUMINANCE
 
 FILES = ("sky.exr", "heap.ply", "snow.tsdf.exr", "salt.tsdf.exr", "grain.stl")
 WHOLE = """
@@ -407,9 +411,9 @@ def _id(value: object) -> str:
         ([380, 780], [1.0], "must be of one length, not 2 and 1"),
         ([380, 500, 500, 780], [1, 1, 1, 1], "wavelength_nm must ascend"),
         ([780, 380], [1, 1], "wavelength_nm must ascend"),
-        ([400, 780], [1, 1], "must cover 380 to 780 nm, not only 400 to 780"),
-        ([380, 700], [1, 1], "must cover 380 to 780 nm, not only 380 to 700"),
-        ([], [], "must cover 380 to 780 nm"),
+        ([401, 780], [1, 1], "must cover 400 to 700 nm, not only 401 to 780; add values for the rest"),
+        ([380, 699], [1, 1], "must cover 400 to 700 nm, not only 380 to 699"),
+        ([], [], "must cover 400 to 700 nm"),
         ([380, 780], [1, -1], "number 2 of coefficient must be >= 0"),
         ([380, math.nan, 780], [1, 1, 1], "number 2 of wavelength_nm must be a finite number"),
         (380, [1], "wavelength_nm must be a list of numbers, not 380"),
@@ -468,6 +472,17 @@ def test_text_that_is_no_scene(tmp_path, content, expected):
         load(path)
     assert str(error.value).startswith(f"{path}: ") and expected in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_table_or_a_picture_is_no_scene(tmp_path):
+    """A table, of more bytes than a scene may have even, says what it is and what is done with it."""
+    table = tmp_path / "sugar.tsdf.exr"
+    table.write_bytes((library.FOLDER / "sugar.tsdf.exr").read_bytes() + bytes(10**6))
+    with pytest.raises(SceneError, match=r"is a table of grains and no scene; .* tsdf-preview, .* table = 'sugar\."):
+        load(table)
+    image.write_exr(tmp_path / "picture.exr", np.ones((2, 2, 3)), attributes={"tsdf_render": "{}"})
+    with pytest.raises(SceneError, match="is an OpenEXR picture and no scene"):
+        load(tmp_path / "picture.exr")
 
 
 def test_values_of_any_size_and_depth_are_answered(folder):
@@ -556,6 +571,35 @@ def test_absorption_between_given_wavelengths():
     spectrum = Absorption("spectral", (0.0, 1.0, 3.0), (380.0, 480.0, 780.0))
     assert absorption_at(spectrum, [380, 430, 480, 630, 780]) == pytest.approx([0.0, 0.5, 1.0, 2.0, 3.0])
     assert absorption_at(Absorption("grey", (2.0,)), [400, 500]).tolist() == [2.0, 2.0]
+
+
+def test_ends_of_a_spectrum_are_held(folder):
+    """What covers 400 to 700 nm, listed or in a file, holds its ends as far as light is seen, and says so; that changes
+    the luminance of any light by less than .05 % of white, for the rest weighs no more."""
+    spectrum = {"wavelength_nm": [400.0, 500.0, 700.0], "coefficient": [1.0, 2.0, 4.0]}
+    read = parse(edited("medium/0/grain/0/absorption", spectrum), folder).media[0].grains[0].absorption
+    assert absorption_at(read, [380, 390, 400, 600, 700, 780]).tolist() == [1.0, 1.0, 1.0, 3.0, 4.0, 4.0]
+    assert held(read) == (400.0, 700.0)
+    assert held(Absorption("spectral", (1.0, 1.0), VISIBLE_NM)) is held(Absorption("spectral", material="ice")) is None
+    for nm in (379.0, 781.0):
+        with pytest.raises(UsageError, match="from 400 to 700 nm only"):
+            absorption_at(read, [nm])
+    (folder / "own.csv").write_text("wavelength_nm,n,k\n400,1.5,1e-6\n550,1.5,2e-6\n700,1.5,4e-6\n")
+    whole = edited("medium/0/grain/0/absorption", {"material": "own.csv"}) | {"metres_per_unit": 1.0}
+    own = parse(whole, folder).media[0].grains[0].absorption
+    assert held(own) == (400.0, 700.0)
+    at = absorption_at(own, [380.0, 780.0], 1.0)
+    assert at == pytest.approx([4 * math.pi * 1e-6 / 380e-9, 4 * math.pi * 4e-6 / 780e-9])
+    said = notes_of(parse(whole, folder))
+    assert len(said) == 1 and "own.csv is known from 400 to 700 nm; its ends are held from 380 to 780" in said[0]
+    (folder / "own.csv").write_text("wavelength_nm,n,k\n450,1.5,1e-6\n550,1.5,2e-6\n700,1.5,4e-6\n")
+    with pytest.raises(
+        SceneError, match="k from 450 to 700 nm only; absorption needs it from 400 to 700 nm: add lines"
+    ):
+        parse(whole, folder)
+    nm, weight = image.spectral_weights()
+    beyond = weight[(nm < 400.0) | (nm > 700.0)] @ LUMINANCE
+    assert np.abs(beyond).sum() < BEYOND / 100.0
 
 
 def test_absorption_that_is_not_known():

@@ -326,8 +326,9 @@ def _collect(findings: list[Finding], form: Format[Any], broken: Broken) -> bool
 def _attributes(data: bytes, header: str) -> tuple[dict[str, Attribute], int]:
     """Return the attributes of the EXR header by name, and where it ends; `header` is the one that holds the JSON."""
     if data[:4] != MAGIC:
-        part = " but a part of a build, of which tsdf-merge makes a table" if begins_part(data) else ""
-        raise FormatError("EXR_MAGIC", f"not an OpenEXR file{part}", "bytes 0")
+        kind = " but a part of a build, of which tsdf-merge makes a table" if begins_part(data) else ""
+        kind = " but a scene, which tsdf-render and tsdf-plan take" if b"[camera]" in data else kind
+        raise FormatError("EXR_MAGIC", f"not an OpenEXR file{kind}", "bytes 0")
     if len(data) < 8:
         raise FormatError("EXR_TRUNCATED", "the file ends too early", f"bytes {len(data)}")
     if data[4:8] != b"\2\0\0\0":

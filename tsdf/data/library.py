@@ -27,7 +27,7 @@ def ready(name: str) -> Path | None:
     FormatError
         There is none of that name; the nearest is told.
     """
-    if not name.replace("-", "").isalnum():
+    if not name.replace("-", "").replace("_", "").isalnum():
         return None
     known = names()
     if name in known:

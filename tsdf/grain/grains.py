@@ -11,6 +11,7 @@ import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -20,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from tsdf.errors import GrainError, UsageError
 from tsdf.grain.exemplars import EXEMPLARS
 from tsdf.grain.meshes import read_mesh
-from tsdf.grain.rounding import grid_step, grid_tilt, is_convex
+from tsdf.grain.rounding import Steps, grid_steps, grid_tilt, is_convex
 from tsdf.grain.surface import (
     MODELLER,
     Floats,
@@ -159,7 +160,13 @@ def load_grain(source: str | Path, repair: bool | Literal["any"] = False, **para
         area, volume = 4 * np.pi, 4 * np.pi / 3
         return Grain("sphere", name, {}, nothing, none, 1.0, area, volume, True, 1, (), digest)
     if not os.path.exists(name):
-        raise GrainError(f"{name}: neither a file nor a built-in grain; built-in grains are {', '.join(BUILT_INS)}")
+        near = get_close_matches(name.lower(), BUILT_INS, 1)
+        hint = f"did you mean {near[0]}? " if near else ""
+        raise GrainError(
+            f"{name}: neither a file nor a built-in grain; {hint}built-in grains are {', '.join(BUILT_INS)}"
+        )
+    if name.lower().endswith(".toml"):
+        raise GrainError(f"{name}: is a scene, which tsdf-render and tsdf-plan take; name a grain")
     vertices, faces = read_mesh(Path(source))
     return grain_from_mesh(vertices, faces, name=Path(source).name, repair=repair)
 
@@ -206,7 +213,7 @@ def grain_from_mesh(
     points, triangles = _checked_arrays(vertices, faces, name)
     notes: list[str] = []
     points, triangles = compact(points, triangles)
-    step = grid_step(points)
+    steps = grid_steps(points)
     low, high = points.min(axis=0), points.max(axis=0)
     centre, scale = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     if not scale > 0:
@@ -248,10 +255,12 @@ def grain_from_mesh(
     middle, radius = bounding_sphere(points)
     points = (points - middle) / radius
     centre, scale = centre + scale * middle, scale * radius
-    tilt = grid_tilt(points, triangles, step / scale)
-    if tilt > MOST_TILT:
-        fault = f"coordinates stand on a grid of {100 * step / scale:.2g} % of R ({step:.2g} in the file)"
-        effect = f"its facets are tilted by about {np.degrees(tilt):.2g} degrees, as if rough"
+    tilt = grid_tilt(points, triangles, Steps(steps.digits / scale, steps.axes / scale))
+    if tilt.angle > MOST_TILT:
+        which = "" if tilt.axes == "xyz" else " and ".join(tilt.axes) + " "
+        grid = f"{100 * tilt.step:.2g} % of R ({tilt.step * scale:.2g} in the file)"
+        fault = f"{which}coordinates stand on a grid of {grid}"
+        effect = f"its facets are tilted by about {np.degrees(tilt.angle):.2g} degrees, as if rough"
         notes.append(f"{fault}: {effect}; export with more digits, in a smaller unit or nearer to the origin")
     normal = area_normals(points, triangles)
     area = 0.5 * float(np.linalg.norm(normal, axis=1).sum())
@@ -267,7 +276,7 @@ def grain_from_mesh(
         float(scale),
         area,
         volume,
-        bodies == 1 and is_convex(points, triangles, step / 2 / scale),
+        bodies == 1 and is_convex(points, triangles, steps.common / 2 / scale),
         bodies,
         tuple(notes),
         mesh_hash(points, triangles),

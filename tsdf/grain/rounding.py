@@ -4,6 +4,8 @@ A file's float32 or its decimals are a grid, on which facets are tilted a little
 units of R, but where said otherwise.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,9 +16,32 @@ FEW_PLANES = 16  # are looked at before all
 MOST_ROUNDING = 2e-6  # [R] coordinates rounded more coarsely than this cannot be told from a shape
 FEWEST_LEVELS = 8  # of coordinates along an axis that tell a grid from a few chosen values
 FEWEST_CORNERS = 64  # of a mesh whose coordinates are rounded rather than chosen
+HEIGHTS = 0.25  # of the steps of two axes, below which the third's shows that these two are a lattice of places
+ALONG_LEVELS = 0.9  # share of the facets with one side along a level, from which on levels are lines of the mesh
+TELLING = 0.2  # of the tilt by the worst axis, from which on an axis is named beside it
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+
+class Steps(NamedTuple):
+    """Steps of the grids on which coordinates stand, 0 where there is none."""
+
+    digits: float  # of all, by the digits of the file alone
+    axes: Floats  # (3,) of each axis, for whatever reason
+
+    @property
+    def common(self) -> float:
+        """The largest with which all coordinates may be off."""
+        return max(self.digits, float(self.axes.max()) if self.axes.min() > 0 else 0.0)
+
+
+class Tilt(NamedTuple):
+    """By how much facets are tilted because coordinates are rounded."""
+
+    angle: float  # the mean over the area [rad]
+    step: float  # of the coarsest grid that does it, in the unit of the points
+    axes: str  # those that do it, of "xyz"
 
 
 def is_convex(points: Floats, faces: Ints, rounding: float = 0.0) -> bool:
@@ -54,8 +79,8 @@ def is_convex(points: Floats, faces: Ints, rounding: float = 0.0) -> bool:
     return not stand_before(points, planes, centroids, slopes, tolerance).any()
 
 
-def grid_step(points: Floats) -> float:
-    """Return the largest step of a grid on which all coordinates stand for want of digits, 0 if there is none.
+def grid_steps(points: Floats) -> Steps:
+    """Return the largest steps of grids on which coordinates stand.
 
     Numbers of float32 stand on a grid of the last bit of the largest of them, written decimals on a power of ten, and
     numbers of either that were scaled afterwards on any; the last is looked for where an axis has eight levels or more.
@@ -69,16 +94,15 @@ def grid_step(points: Floats) -> float:
     with np.errstate(over="ignore"):  # what float32 cannot hold is not of float32
         bits = 2.0**-23 if (points == points.astype(np.float32)).all() else 2.0**-52
     unsure = bits * 2.0 ** np.floor(np.log2(max(largest, 1e-300)))  # the last bit of the largest
-    steps = [unsure if bits == 2.0**-23 else 0.0]
+    digits = unsure if bits == 2.0**-23 else 0.0
     for power in range(int(np.floor(np.log10(max(largest, 1e-300)))), -300, -1):
         step = 10.0**power
         if step <= 100 * unsure:  # finer grids fit anything
             break
         if (np.abs(points - step * np.rint(points / step)) <= 2 * unsure).all():
-            steps.append(step)
+            digits = max(digits, step)
             break
-    axes = [_spacing(axis, unsure) for axis in points.T]
-    return max(*steps, max(axes) if min(axes) > 0 else 0.0)
+    return Steps(digits, np.array([_spacing(axis, unsure) for axis in points.T]))
 
 
 def _spacing(values: Floats, unsure: float) -> float:
@@ -94,30 +118,54 @@ def _spacing(values: Floats, unsure: float) -> float:
     return float(step) if enough and (np.abs(rest - np.rint(rest)) < 0.02).all() else 0.0
 
 
-def grid_tilt(points: Floats, faces: Ints, step: float) -> float:
-    """Return by how much facets are tilted where coordinates are rounded to a grid, the mean over the area [rad].
+def grid_tilt(points: Floats, faces: Ints, steps: Steps) -> Tilt:
+    """Return by how much facets are tilted where coordinates are rounded to a grid.
 
-    A facet with heights h is tilted by sqrt(sum of 1 / h^2) step / sqrt(12) for independent corners. None is if the
-    grid is a design: facets along the axes (voxels), corners in the middle of a grid's edges (marching cubes on
-    binary data), or fewer than `FEWEST_CORNERS`.
+    A facet with heights h and the unit normal n is tilted by sqrt(sum of 1 / h^2) |n step| / sqrt(12) for independent
+    corners. None is if the grid is a design: facets along the axes (voxels), corners in the middle of a grid's edges
+    (marching cubes on binary data), or fewer than `FEWEST_CORNERS`; of an axis with a grid by design only digits count.
 
     Parameters
     ----------
     points : (n, 3) float64
         Vertices [R].
     faces : (m, 3) int64
-    step : float
-        Of the grid [R].
+    steps : Steps
+        Of the grids [R].
     """
-    if step == 0 or len(points) < FEWEST_CORNERS:
-        return 0.0
-    odd = np.rint((points - points.min(axis=0)) / step).astype(np.int64) % 2
-    for turned in np.ndindex(2, 2, 2):
-        if ((odd ^ turned).sum(axis=1) == 1).all():
-            return 0.0
+    step = np.maximum(steps.axes, steps.digits)
+    if not step.any() or len(points) < FEWEST_CORNERS:
+        return Tilt(0.0, 0.0, "")
+    if step.all():
+        odd = np.rint((points - points.min(axis=0)) / step).astype(np.int64) % 2
+        for turned in np.ndindex(2, 2, 2):
+            if ((odd ^ turned).sum(axis=1) == 1).all():
+                return Tilt(0.0, 0.0, "")
     normal = area_normals(points, faces)
     double = np.linalg.norm(normal, axis=1)
+    step[~_rounded(points, faces, step)] = steps.digits
     sides = np.linalg.norm(points[faces] - points[np.roll(faces, -1, axis=1)], axis=2)
-    tilt = np.minimum(np.sqrt((sides**2).sum(axis=1)) / double * step / np.sqrt(12), 1.0)
-    tilt[np.abs(normal).max(axis=1) > (1 - 1e-9) * double] = 0.0
-    return float(np.average(tilt, weights=double))
+    by_axis = (np.sqrt((sides**2).sum(axis=1)) / double**2)[:, None] * np.abs(normal) * step / np.sqrt(12)
+    by_axis[np.abs(normal).max(axis=1) > (1 - 1e-9) * double] = 0.0
+    tilt = np.minimum(np.linalg.norm(by_axis, axis=1), 1.0)
+    means = np.average(by_axis, axis=0, weights=double)
+    telling = np.flatnonzero(means > TELLING * means.max())
+    names = "".join("xyz"[axis] for axis in telling)
+    return Tilt(float(np.average(tilt, weights=double)), float(step[telling].max(initial=0.0)), names)
+
+
+def _rounded(points: Floats, faces: Ints, step: Floats) -> NDArray[np.bool_]:
+    """Return (3,) bool, along which axes coordinates stand on a grid for want of digits and not by design.
+
+    Two axes are a design where the third's grid is much finer: the digits that do for heights would do for places. So
+    is one whose levels are lines of the mesh, as the rings of a lathe and the rows of a field: then each facet, but for
+    those within the first and the last level, has just one side along a level, where rounding makes none or all three.
+    """
+    finest, middle, _ = np.sort(step)
+    rounded = step <= finest if finest < HEIGHTS * middle else np.ones(3, bool)
+    for axis in np.flatnonzero(rounded & (step > 0)):
+        level = np.rint((points[:, axis] - points[:, axis].min()) / step[axis])[faces]
+        inner = (level > 0).any(axis=1) & (level < level.max()).any(axis=1)
+        along = (level == np.roll(level, 1, axis=1)).sum(axis=1)
+        rounded[axis] = (along[inner] == 1).sum() < ALONG_LEVELS * inner.sum()
+    return rounded

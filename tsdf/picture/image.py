@@ -37,6 +37,7 @@ OBSERVER = "observer.csv"  # in tsdf.reference_data: the CIE 1931 2-degree obser
 XYZ_TO_RGB = np.array(  # IEC 61966-2-1
     [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
 )
+LOST = 1e-3  # share of the light of an environment, below which what is negative is the overshoot of a filter
 LARGEST_HALF = 65504.0  # beyond which 16-bit floats are infinite
 OTHERS = {b"#?": "Radiance HDR", b"\x89PNG": "PNG", b"\xff\xd8\xff": "JPEG", b"II*\0": "TIFF", b"MM\0*": "TIFF"}
 
@@ -267,6 +268,7 @@ class Environment(NamedTuple):
 
     radiance: np.ndarray  # (h, w, 3) float64, linear sRGB, finite and >= 0
     notes: tuple[str, ...]  # one line each
+    warnings: tuple[str, ...]  # those of the notes that mean other light than that of the file
 
 
 def read_environment(path: str | os.PathLike[str]) -> Environment:
@@ -304,23 +306,32 @@ def read_environment(path: str | os.PathLike[str]) -> Environment:
         )
     if any((a != b).any() for a, b in zip(*(np.asarray(header[window]) for window in WINDOWS), strict=True)):
         notes.append("its data window is not its display window, which is taken as all directions; outside it is black")
-    rgb = _srgb(rgb, header, notes)
-    _mend(rgb, notes)
-    if not rgb.any():
-        raise TSDFError(f"{name}: every pixel is black, so it lights nothing; name another image")
-    return Environment(rgb, tuple(f"{name}: {note}" for note in notes))
+    rgb, senseless = _srgb(rgb, header, notes)
+    if not (rgb > 0.0).any():
+        raise TSDFError(f"{name}: every pixel is {_dark(rgb)}, so it lights nothing; name another image")
+    warned = [*senseless, *_mend(rgb, notes)]
+    said, told = (tuple(f"{name}: {note}" for note in part) for part in (notes, warned))
+    return Environment(rgb, said, told)
 
 
-def _srgb(rgb: np.ndarray, header: Mapping[str, Any], notes: list[str]) -> np.ndarray:
-    """Return colours in linear sRGB of those with the primaries and the white point that a header states."""
+def _dark(rgb: np.ndarray) -> str:
+    """Return what pixels are of which none is light."""
+    kinds = {"negative": (rgb < 0.0).any(axis=2), "not a number": np.isnan(rgb).any(axis=2)}
+    black = ["black"] * bool((rgb == 0.0).all(axis=2).any())
+    return " or ".join(black + [f"{kind} ({int(bad.sum())} pixels)" for kind, bad in kinds.items() if bad.any()])
+
+
+def _srgb(rgb: np.ndarray, header: Mapping[str, Any], notes: list[str]) -> tuple[np.ndarray, list[str]]:
+    """Return colours in linear sRGB of those with the primaries and the white point that a header states, and which of
+    the notes that are added is a warning."""
     stated = header.get("chromaticities")
     if stated is None:
-        return rgb
+        return rgb, []
     primaries = np.asarray(stated, dtype=np.float64).reshape(4, 2)
     colour = _colour()
     target = colour.RGB_COLOURSPACES["sRGB"]
     if np.abs(primaries - np.vstack((target.primaries, target.whitepoint))).max() < 1e-3:
-        return rgb
+        return rgb, []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -330,14 +341,16 @@ def _srgb(rgb: np.ndarray, header: Mapping[str, Any], notes: list[str]) -> np.nd
             matrix = np.full((3, 3), np.nan)
     if not np.isfinite(matrix).all():
         notes.append("its attribute chromaticities makes no sense; its colours are taken as linear sRGB")
-        return rgb
+        return rgb, notes[-1:]
     notes.append("colours converted to linear sRGB from the primaries that it states (chromaticities)")
     with np.errstate(invalid="ignore", over="ignore"):
-        return rgb @ matrix.T
+        return rgb @ matrix.T, []
 
 
-def _mend(rgb: np.ndarray, notes: list[str]) -> None:
-    """Make every number of an image a radiance, in place, and note how many were none."""
+def _mend(rgb: np.ndarray, notes: list[str]) -> list[str]:
+    """Make every number of an image a radiance, in place, note how many were none, and return which of these notes are
+    warnings."""
+    before = len(notes)
 
     def pixels(bad: np.ndarray) -> str:
         count = int(bad.any(axis=2).sum())
@@ -360,6 +373,8 @@ def _mend(rgb: np.ndarray, notes: list[str]) -> None:
             f"{pixels(negative)}negative, down to {lowest:.2g}, {100.0 * lost:.2g} % of the sum of all: taken as 0"
         )
         rgb[negative] = 0.0
+        return notes[before:] if lost > LOST else notes[before:-1]
+    return notes[before:]
 
 
 def encoded(rgb: npt.ArrayLike, exposure: float = 0.0) -> np.ndarray:

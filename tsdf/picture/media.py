@@ -16,11 +16,12 @@ from tsdf.picture import image
 from tsdf.scene.levels import Traits
 from tsdf.scene.medium import Component, VolumeParameters, free_path, volume_parameters
 from tsdf.scene.scene import Absorption, MediumSpec, Scene
-from tsdf.scene.specs import absorption_at
+from tsdf.scene.specs import VISIBLE_NM, absorption_at, called, held
 from tsdf.walk.lights import LUMINANCE
 from tsdf.walk.walker import UNENDING, Attenuation, Media
 
 DARKEST = 1e-300  # albedo, so that it has a logarithm
+BEYOND = 0.05  # [%] of the luminance of white, from wavelengths outside `KNOWN_NM`: 0.042
 LONGEST_OFFSET = math.sqrt(8.0)  # [R] r and z drawn independently: at most 2 each
 
 
@@ -56,6 +57,21 @@ def spectra_of(spec: Absorption, metres_per_unit: float | None) -> Spectra:
     if spec.kind == "rgb":
         return Spectra(None, np.array(spec.coefficient))
     return Spectra(absorption_at(spec, image.spectral_weights().wavelength_nm, metres_per_unit), np.zeros(3))
+
+
+def notes_of(scene: Scene) -> list[str]:
+    """Return what is to be said of spectra that end where light is still seen, one line for each of a medium."""
+    notes = {}
+    for number, medium in enumerate(scene.media, 1):
+        for grain in medium.grains:
+            if (ends := held(grain.absorption)) is not None:
+                of = f"absorption of {grain.absorption.material}" if grain.absorption.material else "absorption"
+                where = f"{scene.name}: {called('medium', number, medium.name)}: {of}"
+                notes[where] = (
+                    f"{where} is known from {ends[0]:g} to {ends[1]:g} nm; its ends are held from {VISIBLE_NM[0]:g} to "
+                    f"{VISIBLE_NM[1]:g}, which changes luminance by less than {BEYOND:g} % of white"
+                )
+    return list(notes.values())
 
 
 class Amounts:

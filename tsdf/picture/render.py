@@ -65,7 +65,7 @@ class Picture:
     leapt, leaps : int
         How many of the events were not drawn one by one, and how many leaps stand for them.
     trust : Trust, optional
-        Whether its variance is to be believed; None where there is no variance, or nobody has looked.
+        Whether its variance is to be believed; None where nobody has looked.
     processor_seconds : float
         Time that the processors spent on it, all threads together, and whatever else the process did meanwhile.
     """
@@ -453,7 +453,7 @@ class Sums:
             leaps=int(counters[W.LEAPS]),
             faults=int(counters[W.FAULTS]),
             interrupted=interrupted,
-            trust=self.moments.trust(self.samples, self.shape[:2], self.kurtosis) if self.samples.max() > 1 else None,
+            trust=self.moments.trust(self.samples, self.shape[:2], self.kurtosis) if self.samples.any() else None,
         )
 
 

@@ -13,10 +13,12 @@ import numpy as np
 
 from tsdf.walk.lights import LUMINANCE, LightArrays
 
+ENOUGH = 3  # samples of a pixel that tell whether few make most of its variance; of two each makes half
 MOST_VOV = 0.1  # [1] variance of the variance of a picture that is trusted; MCNP's
 SHOWN = 0.1 * MOST_VOV  # [1] `Trust.chance` below which lights show in the variance, though grains send less their way
 LEAST_SLOPE = 3.0  # of the density of samples: below, they have no variance; MCNP's
 IDLE_VOV = 0.01  # below, the largest samples make too little of the variance for their slope to matter
+SAME = 1e-12  # relative difference of samples that is rounding
 LARGEST, RARE, FEWEST = 201, 20, 25  # samples that tell it: so many, of so many times as many at least; MCNP's most
 
 
@@ -27,7 +29,8 @@ class Trust:
     Attributes
     ----------
     vov : float
-        Relative variance of the estimated variance of the picture's mean [1]: 1 where one sample makes it all.
+        Relative variance of the estimated variance of the picture's mean [1]: 1 where one sample makes it all, infinite
+        where a pixel has fewer than `ENOUGH`, unless nothing varies.
     slope : float
         Exponent with which the density of the samples falls off beyond the largest of them; infinite where they are
         too few to tell.
@@ -48,6 +51,11 @@ class Trust:
         return float((self.pixels > MOST_VOV).mean())
 
     @property
+    def few(self) -> bool:
+        """Whether all that is to be said is that samples are too few to say."""
+        return math.isinf(self.vov) and not self.chance > MOST_VOV
+
+    @property
     def doubt(self) -> str | None:
         """Why the error bar of the picture cannot be trusted, in one line; None if it can."""
         if self.chance > MOST_VOV:
@@ -56,6 +64,8 @@ class Trust:
                 f"suns or small bright lights are met by chance alone, about {met:.2g} times in all samples; widen "
                 "them by a smooth sky, or take a level that aims at them"
             )
+        elif self.few:
+            why = f"too few samples to say, fewer than {ENOUGH} in a pixel; take more"
         elif self.vov > MOST_VOV:
             why = (
                 f"a few bright samples make most of it (variance of the variance {self.vov:.2g}, above {MOST_VOV:g}); "
@@ -127,12 +137,25 @@ class Moments:
     def trust(self, samples: np.ndarray, shape: tuple[int, ...], kurtosis: float) -> Trust:
         """Return what is to be said of a picture of so many samples of each pixel; kurtosis as of `kurtosis_of`."""
         second, fourth = self.central(samples)
-        n = np.maximum(samples, 1)
+        varies = second > (SAME * self.first) ** 2
+        second, n = np.where(varies, second, 0.0), np.maximum(samples, ENOUGH)
+        away = np.where(varies, fourth - second**2 / n, 0.0)
+        away *= n * (n - 1) / (n - 2) ** 2  # second**2 where one sample makes it all
         with np.errstate(invalid="ignore", divide="ignore"):
-            pixels = np.where(second > 0.0, fourth / second**2 - 1.0 / n, 0.0)
+            pixels = np.where(varies, away / second**2, 0.0)
         whole = float((second / n**2).sum())
-        vov = float(((fourth - second**2 / n) / n**4).sum()) / whole**2 if whole > 0.0 else 0.0
+        vov = float((away / n**4).sum()) / whole**2 if whole > 0.0 else 0.0
+        few, lone = samples < ENOUGH, samples < 2
+        if few.any() and (varies.any() or (lone.any() and not _alike(self.first))):  # of lone ones only others tell
+            vov = math.inf
+            pixels[few & (lone | varies)] = math.inf
         return Trust(vov, self.slope(samples), kurtosis / max(int(samples.sum()), 1), pixels.reshape(shape))
+
+
+def _alike(values: np.ndarray) -> bool:
+    """Return whether all of several pixels show the same light but for rounding, as in a furnace."""
+    least, most = float(values.min()), float(values.max())
+    return len(values) > 1 and most > 0.0 and most - least <= SAME * most
 
 
 def kurtosis_of(lights: LightArrays) -> float:

@@ -24,7 +24,7 @@ from tsdf.grain.grains import first_hit
 from tsdf.picture import image
 from tsdf.picture.footprint import met_by_pixel
 from tsdf.picture.leaping import GAMMA, checked, leaping
-from tsdf.picture.media import DARKEST, media_of, spectra_of
+from tsdf.picture.media import DARKEST, media_of, notes_of, spectra_of
 from tsdf.picture.trust import MOST_VOV, kurtosis_of
 from tsdf.scene.levels import AUTO, LEVELS, Traits
 from tsdf.scene.medium import Component, VolumeParameters, free_path
@@ -90,6 +90,8 @@ class World:
         Of the media, at the luminance-weighted mean of their absorption.
     notes : tuple of str
         What the user should know, one line each.
+    warnings : tuple of str
+        Those of the notes that mean a picture of something else than was asked for.
     sizes : tuple of InWords
         Of the media, in everybody's words.
     empty : tuple of int
@@ -114,6 +116,7 @@ class World:
     parameters: tuple[VolumeParameters, ...]
     notes: tuple[str, ...]
     sizes: tuple[InWords, ...]
+    warnings: tuple[str, ...] = ()
     empty: tuple[int, ...] = ()
     met: np.ndarray = field(default_factory=lambda: NOBODY)
 
@@ -307,7 +310,7 @@ def build(
     made = brim = placed(traits.placed or singles > 0)
     if not traits.placed and singles and any(medium.inside == "centres" for medium in scene.media):
         brim = placed(False)
-    notes = list(made.notes)
+    notes = [*made.notes, *notes_of(scene)]
     media, absorption, parameters = media_of(scene, traits, tables, limit)
     if records := LEVELS[level].records:
         for grain, table in zip((g for m in scene.media for g in m.grains), tables, strict=True):
@@ -317,20 +320,21 @@ def build(
                     f"build it with {records.option}"
                 )
     memory = _memory(scene, tables if traits.remembers or traits.answered else [], traits.remembers)
-    layers, empty = [], []
+    layers, empty, warned = [], [], []
     for number, (medium, boundary) in enumerate(zip(scene.media, made.boundaries, strict=True), 1):
         extent = _extent(medium, boundary.vertices if boundary is not None else None)
         sticks_out = medium.inside == "centres" and boundary is None
         layers.append(extent / medium.radius - (0.0 if sticks_out else 2.0))
         empty.append(2.0 * medium.radius > extent and medium.inside == "grains")
         if empty[-1]:
-            notes.append(
+            warned.append(
                 f"{scene.name}: {called('medium', number, medium.name)}: a grain of diameter {2.0 * medium.radius:g} "
                 f"does not fit into the medium, which is {extent:.3g} thin: "
                 + ("no grain is there" if singles or traits.remembers else "it is filled as if with smaller grains")
                 + '; take smaller grains (radius is in units of the scene), or inside = "centres"'
             )
-    lights, said = _lights(scene)
+    lights, said, doubtful = _lights(scene)
+    notes += warned
     compiled = compile_tables(tables or [_no_table()], joint=traits.joint)
     leaps, deep = leaping(scene, brim, media, compiled, memory, tables, gamma, lights, progress)
     met = _grains_met(scene, traits, tables, made, parameters, limit)
@@ -374,6 +378,7 @@ def build(
         parameters=parameters,
         notes=(*notes, *grains.notes),
         sizes=tuple(_sizes(scene, tables)),
+        warnings=(*warned, *doubtful),
         empty=tuple(number for number, none in enumerate(empty, 1) if none),
     )
     if scene.render.fewer_far and 0 < singles < ALL:
@@ -520,10 +525,11 @@ def _no_table() -> Table:
     return tsdf_format.read(library.FOLDER / f"glass-beads{library.SUFFIX}")
 
 
-def _lights(scene: Scene) -> tuple[LightArrays, list[str]]:
-    """Return the lights of a scene, and what is to be said of its environment."""
+def _lights(scene: Scene) -> tuple[LightArrays, list[str], list[str]]:
+    """Return the lights of a scene, what is to be said of its environment, and what of that is a warning."""
     constant, suns, environment, rotation = np.zeros(3), [], None, 0.0
     notes: list[str] = []
+    warned: list[str] = []
     for light in scene.lights:
         if isinstance(light, ConstantLight):
             constant += light.radiance
@@ -532,13 +538,14 @@ def _lights(scene: Scene) -> tuple[LightArrays, list[str]]:
         elif isinstance(light, EnvironmentLight):
             if environment is not None:
                 raise SceneError(f"{scene.name}: more than one environment light; add the images into one file")
-            environment, said = image.read_environment(light.file)
+            environment, said, told = image.read_environment(light.file)
             environment *= light.scale
             rotation = light.rotation_deg
             notes += [f"{scene.name}: {note}" for note in said]
+            warned += [f"{scene.name}: {note}" for note in told]
         else:
             assert_never(light)
     try:
-        return compile_lights(constant, environment, rotation, suns), notes
+        return compile_lights(constant, environment, rotation, suns), notes, warned
     except TSDFError as error:
         raise SceneError(f"{scene.name}: {error}") from None

@@ -23,6 +23,7 @@ import numpy as np
 
 from tsdf.data import format as tsdf_format
 from tsdf.data import library
+from tsdf.data.container import MAGIC
 from tsdf.data.table import Table
 from tsdf.errors import FormatError, SceneError, TSDFError, UsageError
 from tsdf.grain import constants
@@ -60,6 +61,7 @@ from tsdf.scene.medium import MAX_PACKING_FRACTION
 from tsdf.scene.sizes import SIZES, WORDS, check_words, convert
 from tsdf.scene.specs import (
     INSIDE,
+    KNOWN_NM,
     UP,
     Absorption,
     Box,
@@ -81,9 +83,9 @@ from tsdf.scene.specs import (
 )
 
 LEVELS = tuple(levels.LEVELS)
-VISIBLE_NM = (380.0, 780.0)  # [nm] what an absorption spectrum must cover
 SMALLEST = 1e-12  # [unit] of anything that has a size
 MAX_BYTES = 1_000_000  # of the TOML text
+HEAD_BYTES = 4096  # that hold the names of what is at the head of a table
 MAX_SIDE = 65536  # [pixel] along one side of the picture
 MAX_PICTURE = 2**25  # of the picture: two gigabytes while it is made
 MAX_SAMPLES = 2**31 - 1  # per pixel
@@ -115,17 +117,20 @@ def load(path: str | os.PathLike[str]) -> Scene:
     (0.5, 'auto')
     """
     name = os.fspath(path)
-    if name in library.names() and not os.path.exists(path):
-        return parse(ball_of(name), name=name)
     try:
+        if not os.path.exists(path) and library.ready(name):
+            return parse(ball_of(name), name=name)
         status = os.stat(path)
         if stat.S_ISDIR(status.st_mode):
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         if not stat.S_ISREG(status.st_mode):
             raise SceneError(f"{name}: is not a regular file; give the path of a TOML file")
+        _check_text(path, name)
         if status.st_size > MAX_BYTES:
             raise SceneError(f"{name}: has {status.st_size} bytes, and a scene at most {MAX_BYTES}; is it a scene?")
         data = tomllib.loads(Path(path).read_bytes().decode("utf-8-sig"))
+    except FormatError as error:  # no ready table either
+        raise SceneError(error.reason) from error
     except OSError as error:
         raise SceneError(f"{name}: cannot be read: {error.strerror or error}; give the path of a TOML file") from error
     except UnicodeDecodeError as error:
@@ -136,6 +141,17 @@ def load(path: str | os.PathLike[str]) -> Scene:
     except ValueError as error:  # a TOMLDecodeError, but also a number of 5000 digits or a zero byte in the path
         raise SceneError(f"{name}: not TOML: {error}; see https://toml.io") from error
     return parse(data, Path(path).parent, name)
+
+
+def _check_text(path: str | os.PathLike[str], name: str) -> None:
+    """Refuse tables and pictures in the place of a scene."""
+    with open(path, "rb") as file:
+        head = file.read(HEAD_BYTES)
+    if head.startswith(MAGIC) and b"tsdf\0string\0" in head:
+        way_out = f"look at it with tsdf-preview, or name it in a scene: table = {os.path.basename(name)!r}"
+        raise SceneError(f"{name}: is a table of grains and no scene; {way_out}")
+    if head.startswith(MAGIC):
+        raise SceneError(f"{name}: is an OpenEXR picture and no scene; give the path of a TOML file")
 
 
 def parse(data: Mapping[str, Any], folder: str | os.PathLike[str] = ".", name: str = "scene") -> Scene:
@@ -181,7 +197,7 @@ def absorbing_material(name: str, folder: str | os.PathLike[str] = ".") -> str |
     Raises
     ------
     UsageError, TSDFError
-        In one line, for what is neither, and for constants that do not say how light is absorbed from 380 to 780 nm.
+        In one line, for what is neither, and for constants that do not say how light is absorbed from 400 to 700 nm.
     """
     path = Path(folder) / name
     if name in ABSORBING:
@@ -193,9 +209,10 @@ def absorbing_material(name: str, folder: str | os.PathLike[str] = ".") -> str |
             "wavelength_nm,n,k or .yml of refractiveindex.info)"
         )
     medium, (low, high) = constants.read(path)
-    if medium.k is None or low > VISIBLE_NM[0] or high < VISIBLE_NM[1]:
+    if medium.k is None or low > KNOWN_NM[0] or high < KNOWN_NM[1]:
         known = "does not say k" if medium.k is None else f"says k from {low:g} to {high:g} nm only"
-        raise TSDFError(f"{path}: {known}; absorption needs it from {VISIBLE_NM[0]:g} to {VISIBLE_NM[1]:g} nm")
+        way_out = f"absorption needs it from {KNOWN_NM[0]:g} to {KNOWN_NM[1]:g} nm: add lines for the rest"
+        raise TSDFError(f"{path}: {known}; {way_out}")
     return path
 
 
@@ -235,10 +252,10 @@ def _absorption(value: Any, key: str, at: Place) -> Absorption:
         at.fail(f"wavelength_nm and coefficient must be of one length, not {len(nm)} and {len(sigma_a)}")
     if any(a >= b for a, b in pairwise(nm)):
         at.fail("wavelength_nm must ascend")
-    low, high = VISIBLE_NM
+    low, high = KNOWN_NM
     if not nm or nm[0] > low or nm[-1] < high:
         covered = f"not only {nm[0]:g} to {nm[-1]:g}" if nm else "not nothing"
-        at.fail(f"wavelength_nm must cover {low:g} to {high:g} nm, {covered}")
+        at.fail(f"wavelength_nm must cover {low:g} to {high:g} nm, {covered}; add values for the rest")
     return Absorption("spectral", sigma_a, nm)
 
 

@@ -20,6 +20,8 @@ from tsdf.grain.materials import optical_constants
 UP = ("z", "y")
 INSIDE = ("grains", "centres")
 METRES_PER_NM = 1e-9
+VISIBLE_NM = (380.0, 780.0)  # [nm] where light is seen
+KNOWN_NM = (400.0, 700.0)  # [nm] what a spectrum must cover; beyond, its ends are held, for light there hardly shows
 SPP = 64  # samples per pixel, where nothing says when to stop
 Triple = tuple[float, float, float]
 
@@ -218,13 +220,13 @@ def absorption_at(spec: Absorption, wavelengths_nm: ArrayLike, metres_per_unit: 
     """Return the absorption coefficient sigma_a by wavelength, (k,) float64 [1/unit].
 
     Of a material it is 4 pi k / wavelength, with k of `materials`; a given spectrum is linear between its wavelengths;
-    grey is the same at all.
+    grey is the same at all. What covers `KNOWN_NM` is held at its ends within `VISIBLE_NM`; see `held`.
 
     Parameters
     ----------
     spec : Absorption
     wavelengths_nm : (k,) array_like
-        [nm], inside the given spectrum or the range of the material.
+        [nm], inside the given spectrum or the range of the material, or seen where their ends are held.
     metres_per_unit : float, optional
         Length of the scene unit [m]; only a material needs it.
 
@@ -243,19 +245,36 @@ def absorption_at(spec: Absorption, wavelengths_nm: ArrayLike, metres_per_unit: 
             raise UsageError(f"absorption of {spec.material} is per metre: say metres_per_unit")
         k = _absorption_index(spec.material, nm)
         return 4.0 * math.pi * k / (nm * METRES_PER_NM) * metres_per_unit
-    low, high = spec.wavelength_nm[0], spec.wavelength_nm[-1]
-    if not ((nm >= low) & (nm <= high)).all():
-        raise UsageError(f"the absorption spectrum is known from {low:g} to {high:g} nm only")
+    nm = _held(nm, (spec.wavelength_nm[0], spec.wavelength_nm[-1]), "the absorption spectrum")
     return np.interp(nm, spec.wavelength_nm, spec.coefficient)
+
+
+def held(spec: Absorption) -> tuple[float, float] | None:
+    """Return where a spectrum ends [nm] of which an end is held to where light is seen no more; None if none is."""
+    if spec.kind != "spectral" or isinstance(spec.material, str):
+        return None
+    low, high = constants.read(spec.material)[1] if spec.material else (spec.wavelength_nm[0], spec.wavelength_nm[-1])
+    return (low, high) if low > VISIBLE_NM[0] or high < VISIBLE_NM[1] else None
+
+
+def _held(nm: np.ndarray, known: tuple[float, float], name: str) -> np.ndarray:
+    """Return wavelengths [nm], those beyond an end that is held at that end."""
+    low, high = known
+    least = min(low, VISIBLE_NM[0]) if low <= KNOWN_NM[0] else low
+    most = max(high, VISIBLE_NM[1]) if high >= KNOWN_NM[1] else high
+    if not ((nm >= least) & (nm <= most)).all():
+        raise UsageError(f"{name} is known from {low:g} to {high:g} nm only")
+    return np.clip(nm, low, high)
 
 
 def _absorption_index(material: str | Path, nm: np.ndarray) -> np.ndarray:
     """Return k of a built-in material or of a file at wavelengths [nm], (n,) float64."""
     if isinstance(material, str):
         return np.array([optical_constants(material, w).k for w in nm.tolist()], dtype=np.float64)
-    medium, (low, high) = constants.read(material)
-    if medium.k is None or not ((nm >= low) & (nm <= high)).all():
-        raise UsageError(f"{material}: k is known from {low:g} to {high:g} nm only")
+    medium, known = constants.read(material)
+    if medium.k is None:
+        raise UsageError(f"{material}: does not say k")
+    nm = _held(nm, known, f"{material}: k")
     return np.array([medium.k(w) for w in nm.tolist()], dtype=np.float64)
 
 

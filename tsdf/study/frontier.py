@@ -291,7 +291,7 @@ class Way:
             if truth:
                 grown.append((whole.processor_seconds, square(whole, truth, False, 1.0)))
         assert whole is not None
-        if whole.trust is not None and whole.trust.doubt is not None:
+        if whole.trust is not None and whole.trust.doubt is not None and not whole.trust.few:  # runs tell
             self.doubts.append(whole.trust.doubt)
         self.runs.append(replace(whole, trust=None))
         self.grown.append(grown)
