@@ -20,7 +20,7 @@ from tsdf.plan.choice import Wish, choose
 from tsdf.plan.evidence import BOLD, BOLD_BIAS, GRAINS, MEETINGS, Evidence
 from tsdf.plan.pilot import CLOCKS, FEWEST, HALVES, MORE, PIXELS, Clocks, Pilot
 from tsdf.plan.prediction import Plan, Prediction
-from tsdf.plan.report import BUSY, digits, why
+from tsdf.plan.report import BUSY, digits, why, wider_sun
 from tsdf.scene.levels import LEVELS
 from tsdf.scene.medium import Component, free_path
 from tsdf.scene.scene import Scene, called
@@ -48,6 +48,9 @@ CHECK = 0.15  # of what is left for pilots, for looks at what is chosen and was 
 BRIEF, MOST_CHECKS = 0.3, 3  # [s] that such a look takes at least, and how many there are at most
 WIDE, WIDEST = 2.0, 50.0  # [deg] of suns in pilots that are smaller in the picture, which single grains would hardly
 # ever meet, at least and at most
+CHEAPER = 1.2  # times as long as a candidate as the chosen takes, from which on it is asked whether that would do
+AGAIN = 1.3  # times as long as its samples took so far, that as many more may take
+LESS = 0.95  # of an error bar that more samples have to leave, or there is no use in them
 RUNG = 1.4  # times as wide as the next narrower one that pilots may look at
 TAILED = 1.5  # times what noise makes of it, that the error bar of what is missed is where few pixels make most of it
 SOON = 0.5  # of `MEETINGS`, after the first round, that there will be enough of after the second
@@ -158,6 +161,7 @@ class _Planning(Evidence):
         self.packings: dict[bool, Packed] = {}
         self.wide = WIDE  # [deg] of suns in pilots, at least
         self.real = 0.0  # `chance` of the suns of the picture
+        self.answered: set[Candidate] = set()  # of which more samples would tell no more
         self.dear = False  # whether single grains cannot be piloted
 
     def plan(self) -> Plan:
@@ -180,8 +184,8 @@ class _Planning(Evidence):
         self.round((1.0 - FIRST - CHECK) * left, list(dict.fromkeys((*self.finalists(), *glints))))
         self.known = 1.0 - CHECK
         self.refer_anew()
-        self.weigh()
         chosen, found, regional = self.settled()
+        self.weigh()
         rest = sorted((p for p in found if p is not chosen), key=lambda p: (p.safe_seconds(self.target), p.floor.value))
         far = bool(chosen.candidate.explicit_grains) and self.far
         thin = all(medium.packing_fraction <= MOST_PACKED for medium in self.scene.media)
@@ -193,23 +197,23 @@ class _Planning(Evidence):
             self.asked, self.target, self.limit if self.said or beyond else None, (chosen, *rest), far, (),
             tuple(lacking), tuple(self.notes), self.spent, self.clocks.wall() - self.began, self.compiling,
             self.threads, self.load, self.spp, self.load * self.wish.glints(chosen, rest) if beyond else 0.0,
-            2.0 / max(self.footprint, 1e-6), regional, self.places, self.packings,
+            2.0 / max(self.footprint, 1e-6), regional, (self.narrowest, self.wide), self.rarer, self.places,
+            self.packings,
         )  # fmt: skip
-        return replace(made, why=why(made, self.bodies, self.footprint, self.coverage, str(self.reference)))
+        advice = wider_sun(made)
+        return replace(
+            made,
+            why=why(made, self.bodies, self.footprint, self.coverage, str(self.reference)),
+            notes=made.notes + ((advice,) if advice else ()),
+        )
 
     def settled(self) -> tuple[Prediction, list[Prediction], bool]:
         """Return what is chosen, which a pilot has seen where one can, all predictions, and whether the choice is by
         the error of regions."""
-        for looks in range(MOST_CHECKS):
-            one = self.choose(self.predictions()).candidate
-            if one in self.pilots or (looks and self.spent > self.ends + BRIEF) or self.stopped():
-                break
-            if self.dear and LEVELS[one.level].traits.packed:
-                if self.possible(one) is not None:
-                    break
-            elif self.add(one):
-                self.round(max(0.5 * (self.ends - self.spent), BRIEF), [one])
-            self.refused |= {one} - set(self.pilots)
+        self.see_to_it()
+        while (asked := self.question()) is not None:
+            self.go_on(*asked)
+        self.see_to_it()
         found = self.predictions()
         seen = [
             p for p in found if p.candidate in self.pilots or (self.dear and LEVELS[p.candidate.level].traits.packed)
@@ -221,6 +225,64 @@ class _Planning(Evidence):
             plain, bolder = (next(p for p in found if p.candidate == one) for one in (chosen.candidate, bold))
             chosen = bolder if bolder.safe_seconds(self.target) < plain.safe_seconds(self.target) else plain
         return chosen, found, regional
+
+    def see_to_it(self) -> None:
+        """Pilot what is chosen, as far as it was not."""
+        for looks in range(MOST_CHECKS):
+            self.see_load()
+            one = self.choose(self.predictions()).candidate
+            if one in self.pilots or (looks and self.spent > self.ends + BRIEF) or self.stopped():
+                break
+            if self.dear and LEVELS[one.level].traits.packed:
+                if self.possible(one) is not None:
+                    break
+            elif self.add(one):
+                self.round(max(0.5 * (self.ends - self.spent), BRIEF), [one])
+            self.refused |= {one} - set(self.pilots)
+
+    def question(self) -> tuple[Candidate, float] | None:
+        """Return what is to be piloted on, for what that may save, and for how long at most [s]; None once all is told,
+        or planning has taken its share of what the chosen takes."""
+        if self.spp is not None or self.stopped():
+            return None
+        found = self.predictions()
+        chosen = self.choose(found)
+        takes = min(chosen.done(self.target), self.limit / self.load)
+        saved = {p.candidate: self.saved(p, takes, p.candidate == chosen.candidate) for p in found}
+        one = max(saved, key=lambda c: saved[c])
+        left = self.ends - self.spent
+        if saved[one] > BRIEF and math.isfinite(takes) and not self.said:
+            left = max(left, min(SHARE * takes, MOST_SECONDS) - self.spent)
+        return (one, left) if saved[one] > 0.0 and left >= BRIEF else None
+
+    def saved(self, p: Prediction, takes: float, chosen: bool) -> float:
+        """Return what it is likely to save of the time that the chosen takes [s], to know whether a candidate meets the
+        target: of another, if it does; of the chosen itself, if it does not, all. Nothing where this is known, or where
+        it would take more than a fifth less at best."""
+        if p.candidate in self.answered or not p.floor.error or (p.candidate.single and self.dear):
+            return 0.0
+        misses = 0.5 * math.erfc((self.target - p.floor.value) / (p.floor.error * math.sqrt(2.0)))
+        if chosen:
+            return misses * takes
+        soon = self.hopeful(p)
+        return (1.0 - misses) * (takes - soon) if soon * CHEAPER < takes else 0.0
+
+    def go_on(self, one: Candidate, seconds: float) -> None:
+        """Take as many samples again of a candidate and of what it is held against, or for so long [s]; it is answered
+        where that does not tell more."""
+        assert self.reference is not None
+        if one not in self.pilots and not self.add(one):
+            self.refused |= {one}
+            return
+        own, best, seen = self.pilots[one], self.pilots[self.reference], self.apart(one)
+        before, took = self.spent, own.busy + best.busy
+        of_reference = best.busy / took if 2 * own.each > best.each else 0.0
+        if not of_reference:  # until it has as many
+            took = own.busy * (best.each / own.each - 1.0) if own.each else best.busy
+        self.round(min(AGAIN * took / self.threads, seconds), [one], of_reference)
+        now = self.apart(one)
+        if self.spent == before or (seen and now and now.square_error > LESS * seen.square_error):
+            self.answered |= {one}
 
     def bolder_of(self, chosen: Prediction) -> Candidate | None:
         """Return a candidate with bolder leaps, where they may win and its error would still do: at the level whose
@@ -289,6 +351,12 @@ class _Planning(Evidence):
         self.chance = kurtosis_of(build(self.scene, "volume", leap=0.0, places=self.places).lights)
         self.rarer = max(self.real / self.chance, 1.0)
         return True
+
+    @property
+    def narrowest(self) -> float:
+        """How wide the smallest sun of the scene is [deg]."""
+        suns = [light.angular_diameter_deg for light in self.asked.lights if isinstance(light, SunLight)]
+        return min(suns, default=math.inf)
 
     def foreseen(self, level: str) -> prior.Expected:
         """Return what is expected of a level, of the medium of which most is."""
@@ -473,14 +541,17 @@ class _Planning(Evidence):
         """Whether as much of the time that the picture may take has gone by on the clock as planning may have of it."""
         return self.said and self.clocks.wall() - self.began - self.compiling > MOST_SHARE * self.whole
 
-    def weigh(self) -> None:
+    def see_load(self) -> None:
         """See how much longer things take than they would if processors had nothing else to do."""
         busy = sum(pilot.busy for pilot in self.pilots.values()) / self.threads
         self.load = max(1.0, sum(pilot.wall for pilot in self.pilots.values()) / max(busy, 1e-9))
+
+    def weigh(self) -> None:
+        """Say what is not known, and how busy processors are."""
         if self.load > BUSY:
             self.notes.append(
-                f"processors are busy with other things: now everything takes {self.load:.1f} times as long; in the "
-                'table "idle" is without that, "busy" with it'
+                f"processors are busy with other things: everything takes {self.load:.1f} times as long as without, "
+                "which is in all times that are said here"
             )
         if self.known > 0.0 and self.stop.is_set():
             self.notes.append("planning was interrupted: this is what pilots had seen by then")
