@@ -17,6 +17,7 @@ from tsdf.errors import SceneError, UsageError
 from tsdf.picture import render, world
 from tsdf.plan import evidence, planner, report, shot
 from tsdf.plan.beliefs import CERTAIN, Belief
+from tsdf.plan.choice import Wish, choose
 from tsdf.plan.pilot import Apart, Clocks, Pilot
 from tsdf.plan.planner import plan
 from tsdf.plan.prediction import TIE, Plan, Prediction
@@ -711,6 +712,26 @@ def test_what_decides_is_asked(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch
     for told in (Belief(0.039, 0.002), Belief(0.01, 0.002)):
         assert asked(replace(open_one, floor=told)) is None
     assert asked(replace(open_one, variance=0.02**2 * 170.0)) is None
+
+
+def test_what_may_be_a_little_above_its_target_is_said(far: Plan) -> None:
+    """A level that is likelier than not to meet the target and is a sixth above it if it misses as much as it may is
+    taken in a second, where what is sure takes three minutes; how much that may be is said, and what is surer. It is
+    rendered until the whole of it is the target, or for longer where it would be above it by more than a fifth then."""
+    sure, near = candidate("explicit", 0.02**2 * 180.0), candidate("volume", 0.0144**2, 0.0138, 0.0066)
+    for target, taken_ in ((0.02, near), (0.0138, sure)):
+        found = (taken_, near if taken_ is sure else sure)
+        made = replace(far, predictions=found, target=target, seconds=None)
+        assert choose([sure, near], Wish(target, 600.0))[0] == taken_
+        assert ("; up to 2.4 % as far as is known" in report._first(made)) == (taken_ is near)
+        assert ("explicit is surer, 3 min" in report._other(made)) == (taken_ is near)
+    for floor, safe in ((Belief(0.0138, 0.0042), False), (Belief(0.01, 0.012), True)):
+        one = replace(near, floor=floor)
+        made = replace(far, predictions=(one, sure), target=0.02, seconds=None)
+        assert (math.hypot(made.noise, floor.value) < 0.0199) == safe
+        assert math.hypot(made.noise, floor.high) <= 1.2 * 0.02 + 1e-9
+        assert one.done(0.02) == pytest.approx((0.0144 / made.noise) ** 2)
+    assert not replace(near, floor=Belief(0.0138, 0.011)).reaches(0.02)
 
 
 def test_all_times_are_of_one_kind(far: Plan) -> None:

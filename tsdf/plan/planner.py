@@ -55,6 +55,7 @@ RUNG = 1.4  # times as wide as the next narrower one that pilots may look at
 TAILED = 1.5  # times what noise makes of it, that the error bar of what is missed is where few pixels make most of it
 SOON = 0.5  # of `MEETINGS`, after the first round, that there will be enough of after the second
 ENOUGH = 4.0  # times `MEETINGS` that they are to be met in the time that the reference has
+MAY = 1.5  # standard errors that a floor may well be off by, where it is asked what is worth a look
 NEAR = 3.0  # times as long as the best as a candidate may seem to take to be looked at again
 EVENT_S = (1.0e-6, 5.0e-6)  # [s] of one explicit grain, an exact sphere and one of facets, about
 PATIENCE = 600.0  # [s] that a picture may take where nothing is said
@@ -253,17 +254,23 @@ class _Planning(Evidence):
         left = self.ends - self.spent
         if saved[one] > BRIEF and math.isfinite(takes) and not self.said:
             left = max(left, min(SHARE * takes, MOST_SECONDS) - self.spent)
-        return (one, left) if saved[one] > 0.0 and left >= BRIEF else None
+        return (self.teller(one), left) if saved[one] > 0.0 and left >= BRIEF else None
+
+    def teller(self, one: Candidate) -> Candidate:
+        """Return whose pilot tells most of what a candidate misses: of chains after as many explicit grains, which all
+        miss the same, the one that has most samples; or itself."""
+        alike = [c for c in self.pilots if c.explicit_grains == one.explicit_grains > 0 and c.leap is None]
+        return max(alike, key=lambda c: self.pilots[c].each, default=one)
 
     def saved(self, p: Prediction, takes: float, chosen: bool) -> float:
         """Return what it is likely to save of the time that the chosen takes [s], to know whether a candidate meets the
         target: of another, if it does; of the chosen itself, if it does not, all. Nothing where this is known, or where
-        it would take more than a fifth less at best."""
-        if p.candidate in self.answered or not p.floor.error or (p.candidate.single and self.dear):
+        another would not take a fifth less at best."""
+        if self.teller(p.candidate) in self.answered or not p.floor.error or (p.candidate.single and self.dear):
             return 0.0
         misses = 0.5 * math.erfc((self.target - p.floor.value) / (p.floor.error * math.sqrt(2.0)))
         if chosen:
-            return misses * takes
+            return misses * takes if p.floor.value + MAY * p.floor.error > self.target else 0.0
         soon = self.hopeful(p)
         return (1.0 - misses) * (takes - soon) if soon * CHEAPER < takes else 0.0
 
@@ -595,7 +602,7 @@ class _Planning(Evidence):
 
     def hopeful(self, p: Prediction) -> float:
         """Return the time to the target [s] if the floor is as low as it may well be."""
-        return p.seconds(self.target, max(p.floor.value - 1.5 * p.floor.error, 0.0))
+        return p.seconds(self.target, max(p.floor.value - MAY * p.floor.error, 0.0))
 
     @property
     def wish(self) -> Wish:

@@ -213,9 +213,9 @@ class Plan:
     def noise(self) -> float:
         """Standard error of pixels at which the whole error is the target, and no more than a fifth above it if it has
         as much beside noise as may well be; half of the target where that is out of reach."""
-        floor = self.chosen.floor
-        likely, safe = self.target**2 - floor.value**2, (SLACK * self.target) ** 2 - floor.high**2
-        return math.sqrt(max(min(likely, safe) if safe > 0.0 else likely, 0.25 * self.target**2))
+        floor, target = self.chosen.floor, self.target
+        likely, safe = target**2 - floor.value**2, (SLACK * target) ** 2 - floor.high**2
+        return math.sqrt(min(likely, safe) if min(likely, safe) > 0.0 else max(likely, 0.25 * target**2))
 
     @property
     def planned(self) -> Scene:

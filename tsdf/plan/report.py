@@ -14,6 +14,7 @@ TARGETS = np.geomspace(0.002, 0.5, 120)  # [1] that are tried for what would cha
 BUSY = 1.5  # times as long as on processors that have nothing else to do, from which on it is said
 MEANINGFUL = 0.5  # [1] above which the error of a pixel says little: a few glints make it
 HELPS = 2.0  # times as much error as under a wider sun there has to be for that to be said
+ABOVE = 1.05  # times the target, that an error may have to be for it to be said
 OTHER = 1.2  # times as high or low as its target, from which on another target is another wish
 
 
@@ -106,9 +107,22 @@ def _first(plan: Plan) -> str:
         met = f"noise {percent(math.sqrt(max(plan.target**2 - p.floor.value**2, 0.0)))}"
     if (blocks := _of_blocks(plan)) is not None:
         met += f"; means of {BLOCK} by {BLOCK} pixels are off by {blocks}"
+    if (most := _at_most(plan)) is not None:
+        met += f"; up to {percent(most)} as far as is known"
     if p.floor.error > p.floor.value > plan.target:
         met += f"; {within(p.floor.value, p.floor.error)} % is expected, not measured"
     return f"take {p.candidate}{far}: {after} ({met})"
+
+
+def _at_most(plan: Plan) -> float | None:
+    """Return how large the error of a picture may be that is done when it is likely to have the target, where that is
+    more."""
+    p = plan.chosen
+    takes = p.done(plan.target)
+    if plan.spp is not None or math.isinf(takes) or (plan.able is not None and takes > plan.able):
+        return None
+    most = math.hypot(p.noise(takes), p.floor.high) if takes else p.floor.high
+    return most if most > ABOVE * plan.target else None
 
 
 def _left(plan: Plan, able: float) -> str:
@@ -201,6 +215,10 @@ def _other(plan: Plan) -> str:
     runner = f"runner-up: {second.candidate}, {by_clock(plan, takes)}" if math.isfinite(takes) else (
         f"runner-up: {second.candidate}, error {percent(second.floor.value)} at best"
     )  # fmt: skip
+    surest = min(plan.predictions, key=lambda p: p.seconds(plan.target, p.floor.high))
+    takes = surest.seconds(plan.target, surest.floor.high)
+    if _at_most(plan) is not None and surest is not chosen and math.isfinite(takes):
+        runner += f"; {surest.candidate} is surer, {by_clock(plan, takes)}"
     flips = {}
     for target in TARGETS:
         best = min(plan.predictions, key=lambda p: p.safe_seconds(float(target)))
