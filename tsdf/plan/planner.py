@@ -49,7 +49,8 @@ BRIEF, MOST_CHECKS = 0.3, 3  # [s] that such a look takes at least, and how many
 WIDE, WIDEST = 2.0, 50.0  # [deg] of suns in pilots that are smaller in the picture, which single grains would hardly
 # ever meet, at least and at most
 CHEAPER = 1.2  # times as long as a candidate as the chosen takes, from which on it is asked whether that would do
-AGAIN = 1.3  # times as long as its samples took so far, that as many more may take
+ENOUGH_MORE = 1.5  # times as many samples as there are, that tell more
+AGAIN = 1.3  # times as long as these are likely to take, that they may
 LESS = 0.95  # of an error bar that more samples have to leave, or there is no use in them
 RUNG = 1.4  # times as wide as the next narrower one that pilots may look at
 TAILED = 1.5  # times what noise makes of it, that the error bar of what is missed is where few pixels make most of it
@@ -266,7 +267,9 @@ class _Planning(Evidence):
         """Return what it is likely to save of the time that the chosen takes [s], to know whether a candidate meets the
         target: of another, if it does; of the chosen itself, if it does not, all. Nothing where this is known, or where
         another would not take a fifth less at best."""
-        if self.teller(p.candidate) in self.answered or not p.floor.error or (p.candidate.single and self.dear):
+        if {p.candidate, self.teller(p.candidate)} & {*self.answered, self.reference} or not p.floor.error:
+            return 0.0
+        if p.candidate.single and self.dear:
             return 0.0
         misses = 0.5 * math.erfc((self.target - p.floor.value) / (p.floor.error * math.sqrt(2.0)))
         if chosen:
@@ -275,18 +278,21 @@ class _Planning(Evidence):
         return (1.0 - misses) * (takes - soon) if soon * CHEAPER < takes else 0.0
 
     def go_on(self, one: Candidate, seconds: float) -> None:
-        """Take as many samples again of a candidate and of what it is held against, or for so long [s]; it is answered
-        where that does not tell more."""
+        """Take about as many samples again of a candidate and of what it is held against, as many of both, for so long
+        at most [s]. It is answered where that does not tell more."""
         assert self.reference is not None
         if one not in self.pilots and not self.add(one):
             self.refused |= {one}
             return
         own, best, seen = self.pilots[one], self.pilots[self.reference], self.apart(one)
-        before, took = self.spent, own.busy + best.busy
-        of_reference = best.busy / took if 2 * own.each > best.each else 0.0
-        if not of_reference:  # until it has as many
-            took = own.busy * (best.each / own.each - 1.0) if own.each else best.busy
-        self.round(min(AGAIN * took / self.threads, seconds), [one], of_reference)
+        most = max(own.done, best.done) if own.active == best.active else 0
+        goals = [1 << math.ceil(math.log2(ENOUGH_MORE * max(most, p.done, 1))) for p in (own, best)]
+        wanted = [p.seconds_to(goal) for p, goal in zip((own, best), goals, strict=True)]
+        if AGAIN * sum(wanted) > seconds and own.done < most:  # as many as the other has will have to do
+            wanted = [own.seconds_to(most), 0.0]
+        of_reference = wanted[1] / max(sum(wanted), 1e-9)
+        before = self.spent
+        self.round(min(AGAIN * sum(wanted), seconds), [one], of_reference)
         now = self.apart(one)
         if self.spent == before or (seen and now and now.square_error > LESS * seen.square_error):
             self.answered |= {one}

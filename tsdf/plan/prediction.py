@@ -120,6 +120,10 @@ class Prediction:
         """Return the time to an error [s] that is at most a fifth larger if the floor is as high as it may well be."""
         return max(self.seconds(target), self.seconds(SLACK * target, self.floor.high))
 
+    def sure_seconds(self, target: float) -> float:
+        """Return the time to an error [s] if the floor is as high as it may well be."""
+        return self.seconds(target, self.floor.high)
+
     def done(self, target: float) -> float:
         """Return when a picture is done that is to have an error [s]."""
         return self.safe_seconds(target) if self.reaches(target) else self.seconds(target)

@@ -215,8 +215,8 @@ def _other(plan: Plan) -> str:
     runner = f"runner-up: {second.candidate}, {by_clock(plan, takes)}" if math.isfinite(takes) else (
         f"runner-up: {second.candidate}, error {percent(second.floor.value)} at best"
     )  # fmt: skip
-    surest = min(plan.predictions, key=lambda p: p.seconds(plan.target, p.floor.high))
-    takes = surest.seconds(plan.target, surest.floor.high)
+    surest = min(plan.predictions, key=lambda p: p.sure_seconds(plan.target))
+    takes = surest.sure_seconds(plan.target)
     if _at_most(plan) is not None and surest is not chosen and math.isfinite(takes):
         runner += f"; {surest.candidate} is surer, {by_clock(plan, takes)}"
     flips = {}
