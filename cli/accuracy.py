@@ -46,7 +46,7 @@ from tsdf.scene.levels import DETAILED as MEASURED
 )
 @seed_option("0")
 @threads_option
-@click.option("--quiet", is_flag=True, help="No progress bar, no table.")
+@click.option("--quiet", is_flag=True, help="No progress bar, no report.")
 def main(
     table: Path, out: Path, packing: tuple[float, ...], layer: tuple[float, ...], levels: str | None,
     mesh: Path | None, seconds: float | None, paths: int | None, packings: int, seed: int, threads: int | None,
@@ -67,6 +67,7 @@ def main(
     from tsdf.data import format as tsdf_format
     from tsdf.scene.scene import GrainSpec
     from tsdf.study import accuracy, plots
+    from tsdf.study import accuracy_files as files
     from tsdf.walk.explicit import mesh_beside
 
     read = tsdf_format.read(table)
@@ -88,12 +89,12 @@ def main(
                 )  # fmt: skip
         except SceneError as error:
             raise TSDFError(f"{error} (--mesh FILE)" if mesh is None else str(error)) from None
-        for name, text in (("accuracy.md", accuracy.markdown(found)), ("accuracy.csv", accuracy.csv_text(found))):
+        for name, text in (("accuracy.md", files.markdown(found)), ("accuracy.csv", files.csv_text(found))):
             write_text(out / name, text)
         if found.rows:
-            plots.save(plots.plot_accuracy(accuracy.facts(found), found.fraction, found.name), out / "accuracy.png")
+            plots.save(plots.plot_accuracy(files.facts(found), found.fraction, found.name), out / "accuracy.png")
     if not quiet:
-        say(accuracy.markdown(found).removesuffix("\n"))
+        say(f"{files.summary(found)}\n{plain(out / 'accuracy.md')} has every number")
     if found.interrupted:
         click.echo(f"interrupted: {plain(out)} holds what was done", err=True)
     return interrupt_status() if found.interrupted else 0

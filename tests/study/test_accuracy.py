@@ -21,7 +21,7 @@ from tsdf.picture import world
 from tsdf.scene.levels import LEVELS
 from tsdf.scene.medium import Component, volume_parameters
 from tsdf.scene.scene import Absorption, GrainSpec, Slab, Sphere
-from tsdf.study import accuracy, experiment, plots
+from tsdf.study import accuracy, accuracy_files, experiment, plots
 from tsdf.study.accuracy import diffusion, measure, slab
 from tsdf.study.experiment import Experiment, Sums, gather, slab_experiment
 
@@ -267,15 +267,31 @@ def test_every_number_has_a_row(small: accuracy.Accuracy) -> None:
         "displacement": levels, "reflectance": 4 * levels, "transmittance": 4 * levels, "profile": 4 * (levels - 1),
         "time": levels,
     }  # fmt: skip
-    lines = list(csv.DictReader(io.StringIO(accuracy.csv_text(small))))
+    lines = list(csv.DictReader(io.StringIO(accuracy_files.csv_text(small))))
     assert len(lines) == len(small.rows) and float(lines[0]["value"]) == small.rows[0].value
     assert lines[0]["deviation"] == "" and lines[0]["layer"] == ""
-    text = accuracy.markdown(small)
+    text = accuracy_files.markdown(small)
     assert "nan" not in text and "| 0.05 | 10 | 60 | 0.99 |" in text
+    begins, _, rest = text.partition("\n## ")
+    short = accuracy_files.summary(small)
+    assert short.startswith(begins) and len(short) < len(rest)
     dark, light = (
         next(r for r in small.rows if r.quantity == "reflectance" and r.albedo == albedo) for albedo in (0.99, 1.0)
     )
     assert dark.value < light.value
+
+
+def test_noise_is_no_headline(small: accuracy.Accuracy) -> None:
+    """What 256 paths say of a level is not told; a deviation of many errors is, before a larger one of few."""
+    assert "teleport | none told (± " in accuracy_files.summary(small)
+    changed = {"reflectance": (-0.2, 0.01), "transmittance": (0.9, 0.5)}
+    rows = [
+        replace(row, deviation=changed[row.quantity][0], deviation_error=changed[row.quantity][1])
+        if row.level == "teleport" and row.quantity in changed
+        else row
+        for row in small.rows
+    ]
+    assert " | -20.00 ± 1 | none told (± 50) |" in accuracy_files.summary(replace(small, rows=tuple(rows)))
 
 
 @pytest.mark.slow
@@ -302,9 +318,9 @@ def test_what_a_table_cannot_is_said() -> None:
     assert all(math.isnan(row.deviation) for row in found.rows if row.fraction == 0.7)
     for words, times in (("--memory 64", 2), ("--joint 32", 1), ("explicit is skipped at packing fraction 0.7", 1)):
         assert sum(words in note for note in found.notes) == times  # of two levels, of one
-    text = accuracy.markdown(found)
+    text = accuracy_files.markdown(found)
     assert "nan" not in text and "--memory 64" in text
-    plots.plot_accuracy(accuracy.facts(found), found.fraction, found.name)
+    plots.plot_accuracy(accuracy_files.facts(found), found.fraction, found.name)
 
 
 @pytest.mark.slow
@@ -331,7 +347,7 @@ def test_interruption_keeps_what_is_done(word: str, rows: int, grain: GrainSpec)
 
     found = measure(grain, [0.5], [2.0], ["teleport", "volume"], paths=64, progress=progress)
     assert found.interrupted
-    assert "Interrupted" in accuracy.markdown(found)
+    assert "Interrupted" in accuracy_files.markdown(found)
     assert len(found.rows) == rows
 
 
@@ -397,7 +413,9 @@ def test_command_writes_the_reports(file: str, tmp_path: Path, capsys: pytest.Ca
     words = [file, "--out", os.fspath(out), "--packing", "0.05", "--layer", "2", "--paths", "64"]
     assert status(*words, "--levels", "teleport") == 0
     assert {p.name for p in out.iterdir()} == {"accuracy.md", "accuracy.csv", "accuracy.png"}
-    assert capsys.readouterr().out == (out / "accuracy.md").read_text()
+    said, report = capsys.readouterr().out, (out / "accuracy.md").read_text()
+    assert said.endswith("accuracy.md has every number\n") and len(said) < len(report)
+    assert said.splitlines()[:5] == report.splitlines()[:5]
 
 
 @pytest.mark.parametrize(

@@ -257,6 +257,15 @@ def test_furnace_with_white_surfaces(what, level, folder, ball):
     assert abs(mean - 1.0) <= max(4.0 * error, 1e-12)
 
 
+@pytest.mark.parametrize("level", ["teleport", "teleport-memory", "volume"])
+def test_a_furnace_seen_along_a_face(level, folder, ball):
+    """No path is given up where the camera stands in a flat face of a mesh and looks along it, which the ray engine
+    meets again and again: rays have to go far to be clear of what they leave at a thousandth of a degree."""
+    along = Camera((0.5, -1.0, 4.0), (1.5, 0.0, 4.0), 16, 12, fov_deg=0.01)
+    speck = white(Sphere((300.0, 400.0, -900.0), 1e-3))  # or nothing would ask the ray engine
+    assert (take(scene_of([Mesh(folder / "box.ply")], ball, speck, camera=along), level, 16).rgb == 1.0).all()
+
+
 # -------------------------------------------------------------------------------------------------- leaks
 
 FLOOR = Rectangle((0.0, 0.0, -4.0), (1000.0, 0.0, 0.0), (0.0, 1000.0, 0.0))

@@ -328,7 +328,7 @@ def build(
                 f"{scene.name}: {called('medium', number, medium.name)}: a grain of diameter {2.0 * medium.radius:g} "
                 f"does not fit into the medium, which is {extent:.3g} thin: "
                 + ("no grain is there" if singles or traits.remembers else "it is filled as if with smaller grains")
-                + '; take smaller grains, or inside = "centres"'
+                + '; take smaller grains (radius is in units of the scene), or inside = "centres"'
             )
     lights, said = _lights(scene)
     compiled = compile_tables(tables or [_no_table()], joint=traits.joint)

@@ -139,7 +139,7 @@ def plot_accuracy(rows: Sequence[Mapping[str, Any]], fraction: float, title: str
     Parameters
     ----------
     rows : sequence of dict
-        As of `accuracy.facts`.
+        As of `accuracy_files.facts`.
     fraction : float
         Packing fraction of the slabs and times that are shown [1].
     title : str

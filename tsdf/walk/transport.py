@@ -45,6 +45,7 @@ from tsdf.walk.sides import HAIR
 from tsdf.walk.walker import (
     ASKED,
     CLEAR,
+    CLEARLY,
     DIM,
     ENDED,
     EVENTS,
@@ -61,7 +62,6 @@ from tsdf.walk.walker import (
     OTHER,
     PATIENCE,
     RAYS,
-    TRIES,
     TRUNCATED,
     UNENDING,
     UNKNOWN,
@@ -454,16 +454,16 @@ def wander(world, batch, w, amounts, once):  # noqa: C901 - all that can become 
 def surface_met(g, p, d, hits, ray):
     """Return distance to the next opaque surface, its number, its normal against d, its thickness, and whether the ray
     engine named a facet that is behind p."""
-    best, which, n, slack, spurious = math.inf, NONE, (0.0, 0.0, 0.0), 0.0, False
+    best, which, n, slack = math.inf, NONE, (0.0, 0.0, 0.0), 0.0
     if g.solid and hits[ray, 0] >= 0:
         facet = hits[ray, 0]
         facets = g.grid.facets
         t, cosine = plane_hit(facets, facet, p, d)
-        slack = facets[facet, 13]
+        slack, n = facets[facet, 13], (facets[facet, 0], facets[facet, 1], facets[facet, 2])
         if t < 0.0:
-            spurious = True
-        elif t < math.inf:
-            best, which, n = t, g.surface[facet], (facets[facet, 0], facets[facet, 1], facets[facet, 2])
+            return best, which, n, slack, True
+        if t < math.inf:
+            best, which = t, g.surface[facet]
             if cosine > 0.0:
                 n = minus(n)
     if g.balls.shape[0] > 0:
@@ -475,7 +475,7 @@ def surface_met(g, p, d, hits, ray):
             if dot(n, d) > 0.0:
                 n = minus(n)
             best, which, slack = t, g.ball_surface[ball], 1e-9 * (radius + abs(p[0]) + abs(p[1]) + abs(p[2]))
-    return best, which, n, slack, spurious
+    return best, which, n, slack, False
 
 
 @njit(forceinline=True, **KERNEL)
@@ -573,11 +573,10 @@ def escape(world, batch, w, amounts):
 
 
 @njit(**KERNEL)
-def again(batch, w, slack):
+def again(batch, w, slack, cosine):
     """Move the start of a walker's next ray beyond a facet that the ray engine sees and that is behind it."""
     w.skip = max(2.0 * w.skip, slack)
-    w.tries += 1
-    if w.tries > TRIES:
+    if w.skip * abs(cosine) > CLEARLY * slack:
         batch.counters[FAULTS] += 1
         w.weight = 0.0
         return ENDED
@@ -591,12 +590,12 @@ def land(world, batch, w, amounts):
     p, e, m = triple(w.p), triple(w.e), w.medium
     t, surface, n, slack, spurious = surface_met(g, p, e, hits, w.ray)
     if spurious:
-        return again(batch, w, slack)
+        return again(batch, w, slack, dot(n, e))
     known = w.ray == hits.shape[0] - 1
     t_b, inside, n_b, slack_b, spurious = boundary_met(g, m, p, e, hits, w.ray, known)
     if spurious:
-        return again(batch, w, slack_b)
-    w.skip, w.tries = 0.0, 0
+        return again(batch, w, slack_b, dot(n_b, e))
+    w.skip = 0.0
     if not inside:  # by rounding: the jump begins on the boundary
         t_b = 0.0
     leaves = t_b < w.length
@@ -647,13 +646,13 @@ def fly(world, batch, w, amounts):
     p, d = triple(w.p), triple(w.d)
     t, surface, n, slack, spurious = surface_met(g, p, d, hits, w.ray)
     if spurious:
-        return again(batch, w, slack)
+        return again(batch, w, slack, dot(n, d))
     home, t_b, n_b, slack_b = NONE, math.inf, n, 0.0
     for m in range(g.kind.shape[0]):
         known = m == w.medium and w.ray == hits.shape[0] - 1
         t_m, inside, n_m, slack_m, spurious = boundary_met(g, m, p, d, hits, w.ray, known)
         if spurious:
-            return again(batch, w, slack_m)
+            return again(batch, w, slack_m, dot(n_m, d))
         if home == NONE and (inside or t_m < t_b):
             unsure = inside and w.medium == UNKNOWN and g.kind[m] == MESH
             if unsure and slipped(g.grid, hits[hits.shape[0] - 1], m, p, GRAZING * slack_m):
@@ -663,7 +662,7 @@ def fly(world, batch, w, amounts):
                 home = m
     if home != w.medium:
         w.free, w.left = -1.0, 0
-    w.skip, w.tries, w.medium = 0.0, 0, home
+    w.skip, w.medium = 0.0, home
     facing = abs(dot(n, d)) if t < math.inf else 1.0
     if home != NONE:
         state = pass_through(world, batch, w, amounts, t_b - HAIR * beyond(slack_b, dot(n_b, d)), t, slack / facing)
@@ -983,7 +982,7 @@ def spawn(batch, live, job, first, count):
             w.colour[k] = 1.0
         w.weight, w.luck, w.pdf, w.free, w.skip = 1.0, 0.0, -1.0, -1.0, 0.0
         w.key, w.events, w.sample, w.ray, w.medium, w.mode = key + GOLDEN, 0, local, NONE, UNKNOWN, FLY
-        w.tries, w.shadow, w.single, w.left = 0, 0, 0, 0
+        w.shadow, w.single, w.left = 0, 0, 0
         if job.met.shape[0] > 0:
             w.single = job.met[pixel]
         for k in range(batch.amounts.shape[1]):
