@@ -58,7 +58,7 @@ def choose(found: list[Prediction], wish: Wish) -> tuple[Prediction, bool]:
         aimed = [p for p in found if not wish.unfinished(p)] or found
         enough = max(wish.target, TIE * min(after[p.candidate] for p in aimed))
         alike = [p for p in aimed if after[p.candidate] <= enough] or aimed  # of pilots without light
-        fit = [p for p in alike if p.reaches(wish.target)]
+        fit = [p for p in alike if p.floor.high < wish.target]
         return min(fit, key=lambda p: p.turn) if fit else safest(alike, lambda p: p.floor.high), False
     limit, time_of = wish.limit, Prediction.sure_seconds
     takes, soon = (min(by(p, wish.target) for p in found) for by in (time_of, Prediction.safe_seconds))

@@ -51,6 +51,7 @@ WIDE, WIDEST = 2.0, 50.0  # [deg] of suns in pilots that are smaller in the pict
 CHEAPER = 1.2  # times as long as a candidate as the chosen takes, from which on it is asked whether that would do
 ENOUGH_MORE = 1.5  # times as many samples as there are, that tell more
 AGAIN = 1.3  # times as long as these are likely to take, that they may
+FOREVER = 1e9  # [s] that something takes which never comes to an end
 LESS = 0.95  # of an error bar that more samples have to leave, or there is no use in them
 RUNG = 1.4  # times as wide as the next narrower one that pilots may look at
 TAILED = 1.5  # times what noise makes of it, that the error bar of what is missed is where few pixels make most of it
@@ -249,11 +250,11 @@ class _Planning(Evidence):
             return None
         found = self.predictions()
         chosen = self.choose(found)
-        takes = min(chosen.done(self.target), self.limit / self.load)
+        takes = min(chosen.done(self.target), self.limit / self.load, FOREVER)
         saved = {p.candidate: self.saved(p, takes, p.candidate == chosen.candidate) for p in found}
         one = max(saved, key=lambda c: saved[c])
         left = self.ends - self.spent
-        if saved[one] > BRIEF and math.isfinite(takes) and not self.said:
+        if saved[one] > BRIEF and takes < FOREVER and not self.said:
             left = max(left, min(SHARE * takes, MOST_SECONDS) - self.spent)
         return (self.teller(one), left) if saved[one] > 0.0 and left >= BRIEF else None
 
