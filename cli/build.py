@@ -123,7 +123,8 @@ def estimate(quality: str, paths: float, pace: float, seconds: float) -> str:
     metavar="NAME|FILE",
     help="Built in, in air: ice (200 to 5000 nm), water (200 to 4000), quartz (198 to 3000), salt (200 to 30000), "
     "glass (N-BK7, 300 to 2500), sucrose (400 to 700). Or a file of your own: lines of wavelength_nm,n,k "
-    "under that header (.csv), or an entry of refractiveindex.info (.yml).",
+    "under that header (.csv), or an entry of refractiveindex.info (.yml). Between lines log k is linear, beside k = 0 "
+    "k itself.",
 )
 @click.option(
     "--wavelength-nm", type=float, help=f"Wavelength for --material [nm].  [default: {DEFAULT_WAVELENGTH_NM:g}]"

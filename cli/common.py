@@ -13,7 +13,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import click
 
@@ -151,19 +151,40 @@ def beside(work: Callable[[], T]) -> Callable[[], T]:
 # --- outputs ------------------------------------------------------------------------
 
 
-def check_output(out: Path, *inputs: Path, beside: Iterable[Path] = (), part: bool = False) -> None:
+class Output(NamedTuple):
+    """A file that a command is to write."""
+
+    option: str  # that says where
+    path: Path
+    printed: str = ""  # what to say to have it on standard output instead, where that can be
+
+
+def check_output(
+    out: Path, *inputs: Path, beside: Iterable[Path] = (), part: bool = False, option: str = "--out", printed: str = ""
+) -> None:
     """Refuse an output that cannot be written, or would replace an input, before any work is done for it.
 
     Parameters
     ----------
     out : path
-        What --out names.
     inputs : paths
         All that is read. However they are spelled and linked, they are left alone.
     beside : paths
         What is written beside `out`.
     part : bool
         Whether `out` is a part file; no other output replaces one, which holds the paths of an unfinished build.
+    option, printed : str
+        As of an `Output`.
+
+    Raises
+    ------
+    TSDFError
+    """
+    check_outputs([Output(option, out, printed), *(Output(option, path) for path in beside)], *inputs, part=part)
+
+
+def check_outputs(outputs: Sequence[Output], *inputs: Path, part: bool = False) -> None:
+    """Refuse outputs as `check_output` does, the first of which may be a part file.
 
     Raises
     ------
@@ -173,27 +194,34 @@ def check_output(out: Path, *inputs: Path, beside: Iterable[Path] = (), part: bo
 
     read = [source for path in inputs for source in files.sources(Path(path))]
     written: list[Path] = []
-    for path in (out, *beside):
+    for number, (option, path, printed) in enumerate(outputs):
         shown = plain(path)
         if shown != os.fspath(path):
-            raise UsageError(f"cannot write {shown}: its name cannot be shown on one line; choose another --out")
+            raise UsageError(f"cannot write {shown}: its name cannot be shown on one line; choose another {option}")
+        if files.is_stream(path):
+            ways = f"choose another {option}" + (f", or {printed}" if printed else "")
+            raise TSDFError(
+                f"cannot write {shown}: it is no regular file but a stream (screen, pipe or device); {ways}"
+            )
         if any(_same(path, other) for other in read):
-            raise UsageError(f"cannot write {shown}: it is an input; choose another --out")
+            raise UsageError(f"cannot write {shown}: it is an input; choose another {option}")
         if any(_same(path, other) for other in written):
-            raise UsageError(f"cannot write {shown}: another output is the same file; choose another --out")
-        if path == out and not part and archive.is_part(path):
+            raise UsageError(f"cannot write {shown}: another output is the same file; choose another {option}")
+        if number == 0 and not part and archive.is_part(path):
             raise TSDFError(
                 f"cannot write {shown}: it holds paths of an unfinished build, which tsdf-merge takes, or --resume "
-                "with the --out of that build; choose another --out, or delete it"
+                f"with the --out of that build; choose another {option}, or delete it"
             )
         written.append(path)
         folder = Path(os.path.realpath(path)).parent
         if not folder.is_dir():
-            raise TSDFError(f"cannot write {shown}: {plain(folder)} is not a folder; make it, or choose another --out")
+            raise TSDFError(
+                f"cannot write {shown}: {plain(folder)} is not a folder; make it, or choose another {option}"
+            )
         try:
             files.probe(path)
         except OSError as error:
-            raise TSDFError(f"cannot write {shown}: {error.strerror or error}; choose another --out") from None
+            raise TSDFError(f"cannot write {shown}: {error.strerror or error}; choose another {option}") from None
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:

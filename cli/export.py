@@ -15,7 +15,7 @@ MEDIA = ("pbrt", "blender", "openpbr", "materialx", "arnold", "karma", "csv", "n
 TARGETS = (*MEDIA, *SPECTRAL)
 ONLY = {  # what some targets alone can be told
     **dict.fromkeys(("deep_colour", "colour_thickness", "lobes", "kept", "thickness", "measure"), MEDIA),
-    **dict.fromkeys(("wavelength_nm", "settings", "table_paths", "threads", "quiet"), SPECTRAL),
+    **dict.fromkeys(("wavelength_nm", "settings", "fresnel", "table_paths", "threads", "quiet"), SPECTRAL),
     "orders": ("disort",),
 }
 
@@ -97,7 +97,7 @@ def _check_numbers(
 def main(  # noqa: PLR0913 - an argument for each option
     files: tuple[str, ...], to: str, absorption: str | None, material: str | None, deep_colour: str | None,
     colour_thickness: float | None, unit: float | None, lobes: int | None, kept: float, thickness: float | None,
-    measure: bool, wavelength_nm: str | None, orders: int, settings: dict[str, str],
+    measure: bool, wavelength_nm: str | None, orders: int, settings: dict[str, str], fresnel: str | None,
     table_paths: int, threads: int | None, quiet: bool, out: str | None, **options: float | None,
 ) -> None:  # fmt: skip
     """Write the medium of grains of the table FILE for another renderer, or the table as plain arrays.
@@ -111,7 +111,7 @@ def main(  # noqa: PLR0913 - an argument for each option
     if to in SPECTRAL:
         from tsdf.cli import radiative
 
-        building = {"settings": settings, "table_paths": table_paths, "threads": threads}
+        building = {"settings": settings, "fresnel": fresnel, "table_paths": table_paths, "threads": threads}
         said_so = radiative.Said(absorption, material, wavelength_nm, unit, orders, out, options, building, quiet)
         radiative.export(files, to, said_so)
         return
@@ -130,7 +130,7 @@ def main(  # noqa: PLR0913 - an argument for each option
     if to == "npz" and out is None:
         raise UsageError("npz is no text: say with --out where to write it")
     if out is not None:
-        check_output(Path(out), Path(file))
+        check_output(Path(out), Path(file), printed="" if to == "npz" else "leave it out")
 
     from tsdf.data import format as tsdf_format
     from tsdf.loaders import export

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tsdf.cli.absorption import METRES
 from tsdf.cli.common import LEVELS, Tool, plain
 from tsdf.cli.sizes import colour_of, coloured, in_words, said, sized
 
@@ -87,6 +88,7 @@ def main(
     (product,) = times_radius(absorption, radius, unit)
     facts = describe(table, product, radius)
     facts |= describe_sizes(grains, radius)
+    facts["metres_per_unit"] = unit
     if colour:
         facts["colour"] = describe_colour(table, grains, radius, colour, colour_thickness, level)
     if grains.packing_fraction is not None:
@@ -236,14 +238,13 @@ def describe_medium(
 def _others(facts: Mapping[str, Any]) -> Iterator[str]:
     """The quantities that others ask for, sizes, and the colour, for people."""
     yield "in others' words (docs/glossary.md)"
-    sizes = facts["sizes"]
+    sizes, length = facts["sizes"], _length(facts)
     for name, (with_radius, without, word) in OTHERS.items():
         value, error = facts[name], facts["standard_errors"][name]
         spread = "" if value is None else " exact" if facts["method"] == "exact" else f" +- {error:.1g}"
-        unit = without if sizes["radius"] is None else with_radius
+        unit = without if sizes["radius"] is None else with_radius.replace("units", length)
         text = "unknown" if value is None else f"{value:.6g}{spread} {unit}".rstrip()
         yield f"  {name:<26} {text}" + (f"  ({word})" if word else "")
-    length = "R" if sizes["radius"] is None else "units"
     for name, value in sizes.items():
         if value is not None and name != "effective_radius":
             yield f"  {name:<26} {value:.6g} {SIZE_UNITS.get(name, length)}".rstrip()
@@ -251,18 +252,26 @@ def _others(facts: Mapping[str, Any]) -> Iterator[str]:
         colour = facts["colour"]
         body = "a deep medium" if colour["thickness"] is None else f"a slab {colour['thickness']:g} {length} thick"
         yield f"colour of {body} in diffuse light: {', '.join(f'{c:g}' for c in colour['asked'])}"
-        yield f"  {'absorption':<26} {_conventions(colour)}"
+        yield f"  {'absorption':<26} {_conventions(colour, length)}"
         if "rendered" in colour:
             seen = colour["rendered"]
             by = ", ".join(f"{c:.4f} +- {e:.1g}" for c, e in zip(seen["colour"], seen["standard_errors"], strict=True))
             yield f"  {'rendered, ' + seen['level']:<26} {by}"
             if "absorption_times_radius" in seen:
-                yield f"  {'absorption right there':<26} {_conventions(seen)}"
+                yield f"  {'absorption right there':<26} {_conventions(seen, length)}"
 
 
-def _conventions(facts: Mapping[str, Any]) -> str:
+def _length(facts: Mapping[str, Any]) -> str:
+    """In what lengths are: R, or the unit of the radius, by its name where it has one."""
+    if facts["sizes"]["radius"] is None:
+        return "R"
+    metres = facts["metres_per_unit"]
+    return next((name for name, length in METRES.items() if metres and math.isclose(length, metres)), "units")
+
+
+def _conventions(facts: Mapping[str, Any], length: str) -> str:
     """An absorption in all conventions that are known."""
-    known = {"R": "absorption_times_radius", "unit": "absorption", "m": "absorption_per_metre"}
+    known = {"R": "absorption_times_radius", length.removesuffix("s"): "absorption", "m": "absorption_per_metre"}
     return " = ".join(
         f"{', '.join(f'{x:.4g}' for x in facts[key])} / {name}" for name, key in known.items() if facts[key] is not None
     )
@@ -303,7 +312,8 @@ def _lines(facts: Mapping[str, Any]) -> Iterator[str]:
         yield row("source", facts["source"])
     yield "statistics"
     if product := facts["absorption_times_radius"]:
-        both = f"{product:g} / R" + ("" if facts["absorption"] is None else f", {facts['absorption']:g} / unit")
+        by_unit = f", {facts['absorption'] or 0.0:g} / {_length(facts).removesuffix('s')}"
+        both = f"{product:g} / R" + ("" if facts["absorption"] is None else by_unit)
         yield row("absorption", f"{both}, in albedo and mean_cosine; all else is lossless")
     for name, error in facts["standard_errors"].items():
         if name == "legendre_moments" or name not in facts or name in OTHERS:
@@ -316,11 +326,11 @@ def _lines(facts: Mapping[str, Any]) -> Iterator[str]:
     yield from _others(facts)
     if "medium" in facts:
         medium = facts["medium"]
-        length = "R" if medium["radius"] is None else "units"
+        length = _length(facts)
         bare = ", without the colour's absorption" if "colour" in facts else ""
         yield f"medium, packing fraction {medium['packing_fraction']:g}{bare}"
         if medium["radius"] is not None:
-            yield row("radius", f"{medium['radius']:g} units")
+            yield row("radius", f"{medium['radius']:g} {length}")
         for name in LENGTHS:
             yield row(name, f"{known(medium[name], '.6g')} {length}")
         for name in COEFFICIENTS:

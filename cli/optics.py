@@ -16,11 +16,11 @@ FORWARDS = ("kept", "apart", "delta-m")
 @spectral.options
 @click.option(
     "--phase", type=click.Path(path_type=Path), metavar="PATH",
-    help="Write phase functions: angle [deg] and one column a wavelength, mean over the sphere 1.",
+    help="Write phase functions: angle [deg] and one column a wavelength, mean over the sphere 1; - prints them.",
 )  # fmt: skip
 @click.option(
     "--moments", type=click.Path(path_type=Path), metavar="PATH",
-    help="Write Legendre moments as CSV, one column a wavelength.",
+    help="Write Legendre moments as CSV, one column a wavelength; - prints them.",
 )  # fmt: skip
 @click.option(
     "--orders", callback=whole_number, default="128", show_default=True, metavar="N",
@@ -44,7 +44,7 @@ def main(
     check_numbers(threads=said["threads"], **{"table-paths": said["table_paths"]})
     if not 0 <= orders <= 1024:
         raise UsageError(f"--orders is 0 to 1024, not {orders}")
-    spectral.check(asked, csv_file, plot, phase, moments)
+    spectral.check(asked, as_json, csv=csv_file, plot=plot, phase=phase, moments=moments)
     if plot is not None:
         from tsdf.study.plots import check_suffix
 
@@ -53,7 +53,6 @@ def main(
     import numpy as np
 
     from tsdf.data.phase import parted, phase_text
-    from tsdf.files import replacing
     from tsdf.study import spectra
 
     with working(quiet) as work:
@@ -66,20 +65,18 @@ def main(
     )
     notes = [
         f"single scattering of {family.tables[0].header['grain']['name']}, {c.material} ({c.source}), {size}",
-        f"tables at n = {', '.join(f'{eta:.5g}' for eta in family.eta)}{missed}",
+        f"{spectral.tables_of(family)}{missed}",
         *found.notes,
     ]
     notes = [plain(note) for note in notes]
     if phase is not None:
-        edges, masses = family.masses(c.n, np.nan_to_num(found.absorption_times_radius))
-        with replacing(phase) as temporary:
-            temporary.write_text(phase_text(edges, masses, spectra.wavelength_heads(c), notes[:1]), "utf-8")
+        edges, masses = family.masses(found)
+        spectral.write(phase, lambda: phase_text(edges, masses, spectra.wavelength_heads(c), notes[:1]))
     if moments is not None:
         left, straight = parted(*spectra.moments_of(family, found, orders), forward)
         columns = {"order": np.arange(orders + 1.0)} | dict(zip(spectra.wavelength_heads(c), left, strict=True))
         told = [notes[0], f"goes straight on ({forward}): {' '.join(f'{x:.8g}' for x in straight)}"]
-        with replacing(moments) as temporary:
-            temporary.write_text(spectral.csv_text(columns, told), "utf-8")
+        spectral.write(moments, lambda: spectral.csv_text(columns, told))
     if plot is not None:
         from tsdf.study import plots, spectral_plots
 
@@ -87,5 +84,7 @@ def main(
     facts = {
         "grain": family.tables[0].header["grain"]["name"], "material": c.material, "source": c.source,
         "radius_m": found.radius, "size": size, "table_eta": family.eta.tolist(),
+        "fresnel": family.tables[0].header["optics"]["fresnel"], "material_density": words.sizes.material_density,
     }  # fmt: skip
-    spectral.tell(spectra.columns(found), facts, notes, as_json, csv_file, quiet)
+    spectral.tell(spectra.columns(found), facts, notes, as_json, csv_file,
+                  quiet or any(map(spectral.is_printed, (csv_file, phase, moments))))  # fmt: skip

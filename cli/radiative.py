@@ -58,7 +58,8 @@ def export(files: tuple[str, ...], to: str, said: Said) -> None:
                if name in (*spectral.LENGTHS, "ssa")}  # fmt: skip
     wavelengths = SNICAR if to == "snicar" else said.wavelength_nm or "300:2500:10"
     given = dict.fromkeys((*spectral.LENGTHS, "ssa")) | lengths | {
-        "material": said.material, "wavelength_nm": wavelengths, **said.building,
+        "material_density": words.get("material_density"), "material": said.material, "wavelength_nm": wavelengths,
+        **said.building,
     }  # fmt: skip
     asked = spectral.Asked.of(files, given)
     single = to in MONOCHROME and said.material is None and said.wavelength_nm is None and asked.tabulated
@@ -69,7 +70,7 @@ def export(files: tuple[str, ...], to: str, said: Said) -> None:
     elif said.absorption is not None:
         raise UsageError("--absorption is for one table and no wavelengths; say --material instead")
     if said.out is not None:
-        check_output(Path(said.out), *asked.inputs)
+        check_output(Path(said.out), *asked.inputs, printed="" if to in FILES else "leave it out")
 
     from tsdf.loaders import radiative
     from tsdf.study import spectra
@@ -77,9 +78,7 @@ def export(files: tuple[str, ...], to: str, said: Said) -> None:
     with working(said.quiet) as work:
         constants = None if single else asked.constants()
         family = asked.family(constants, work.progress)
-    amounts = {name: words[name] for name in (*AMOUNTS, "material_density") if name in words}
-    density = {name: amounts.pop(name) for name in ("material_density",) if name in amounts}
-    grain = asked.words(family, density, **amounts)
+    grain = asked.words(family, **{name: words[name] for name in AMOUNTS if name in words})
     if single:
         radius = grain.radius / metres if lengths else None  # of no use where nobody said it
         constants = _at(family, times_radius(said.absorption, radius, said.unit)[0], grain.radius)
@@ -88,8 +87,8 @@ def export(files: tuple[str, ...], to: str, said: Said) -> None:
     name, c = family.tables[0].header["grain"]["name"], found.constants
     of = f"{c.material} ({c.source})" if c.material else f"n {c.n[0]:.6g}, absorption " \
         f"{found.absorption_times_radius[0]:.6g} / R"  # fmt: skip
-    tables = f"tables at n = {', '.join(f'{eta:.5g}' for eta in family.eta)}"
-    notes = tuple(plain(note) for note in (f"{name}, {of}, {asked.told(grain)}; by tsdf-export", tables, *found.notes))
+    tables, size = spectral.tables_of(family), asked.told(grain)
+    notes = tuple(plain(note) for note in (f"{name}, {of}, {size}; by tsdf-export", tables, *found.notes))
     request = radiative.Request(family, found, grain, notes, said.orders)
     if to in FILES:
         assert said.out is not None

@@ -116,7 +116,7 @@ def in_words(table: "Table", words: Mapping[str, float], unit: float | None, amo
 
 def by_option(error: UsageError) -> str:
     """Return what `scene.sizes` said, with the way out by option."""
-    text = str(error).replace("say material_density", "say --material-density")
+    text = re.sub(r"(say|another) material_density", r"\1 --material-density", str(error))
     return text.replace("packing_fraction = ", "--packing ")
 
 

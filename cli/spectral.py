@@ -11,8 +11,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from tsdf.cli.common import check_output, plain, say, setting, threads_option, whole_number
+from tsdf.cli.common import (
+    Output,
+    check_outputs,
+    plain,
+    say,
+    setting,
+    threads_option,
+    whole_number,
+    write_text,
+)
 from tsdf.cli.sizes import by_option, measured
+from tsdf.cli.sizes import said as numbers
 from tsdf.errors import UsageError
 
 if TYPE_CHECKING:
@@ -25,6 +35,7 @@ SUFFIX = ".exr"  # of tables; all else is a grain
 DEFAULT_SIZE = ("effective_radius", 2e-4)  # [m] where nothing is said: old snow
 TABLE_PATHS = 2_000_000  # of each table that is made
 LENGTHS = ("radius", "effective_radius", "volume_radius", "maximum_dimension", "sieve")
+FRESNEL = {"un": "averaged at each hit", "sp": "polarisations kept apart"}
 Command = Callable[..., Any]
 
 
@@ -44,6 +55,9 @@ def building(command: Command) -> Command:
         (
             click.option("--set", "settings", multiple=True, callback=setting, metavar="NAME=VALUE",
                          help="A parameter of a built-in grain; tsdf-build --grains lists them."),
+            click.option("--fresnel", type=click.Choice(tuple(FRESNEL)),
+                         help="Of tables that are made: reflectance averaged at each hit, or polarisations kept apart, "
+                         "which is exact (sphere only).  [default: un]"),
             click.option("--table-paths", callback=whole_number, default=f"{TABLE_PATHS:g}", show_default=True,
                          metavar="N", help="Paths of each table that is made of a GRAIN."),
             threads_option,
@@ -59,8 +73,9 @@ def options(command: Command) -> Command:
         (
             click.argument("grains", nargs=-1, required=True, metavar="GRAIN|TABLE.."),
             click.option("--material", metavar="NAME|FILE",
-                         help="As of tsdf-build: ice, water, quartz, salt, glass, sucrose, or your own constants.  "
-                         "[default: that of the TABLE, else ice]"),
+                         help="As of tsdf-build: ice, water, quartz, salt, glass, sucrose, or your own constants, of "
+                         "which log k is linear between rows, but k next to a row of 0.  [default: that of the TABLE, "
+                         "else ice]"),
             click.option("--wavelength-nm", default="300:2500:10", show_default=True, metavar="FROM:TO:STEP|A,B,..",
                          help="Wavelengths [nm], ends included."),
             click.option("--radius", callback=metres, metavar="LENGTH", help="Bounding radius R, 0.5mm say."),
@@ -70,9 +85,12 @@ def options(command: Command) -> Command:
             click.option("--maximum-dimension", callback=metres, metavar="LENGTH", help="Between any two points."),
             click.option("--sieve", callback=metres, metavar="LENGTH", help="Mesh width that grains just pass."),
             click.option("--ssa", type=float, metavar="X", help="Specific surface area [m2/kg]."),
+            click.option("--material-density", type=float, metavar="X",
+                         help="Of the solid [kg/m3].  [default: that of the --material, else of the TABLE's own]"),
             building,
             click.option("--json", "as_json", is_flag=True, help="Print one JSON object."),
-            click.option("--csv", "csv_file", type=click.Path(path_type=Path), metavar="PATH", help="Write columns."),
+            click.option("--csv", "csv_file", type=click.Path(path_type=Path), metavar="PATH",
+                         help="Write columns; - prints them."),
             click.option("--plot", type=click.Path(path_type=Path), metavar="PATH", help="Chart, .png, .pdf or .svg."),
             click.option("--quiet", is_flag=True, help="No progress bar, no table."),
         )
@@ -118,7 +136,9 @@ class Asked(NamedTuple):
     material: str
     wavelength_nm: str
     sizes: Mapping[str, float]
+    material_density: float | None
     settings: Mapping[str, str]
+    fresnel: str
     table_paths: int
     threads: int
 
@@ -130,7 +150,8 @@ class Asked(NamedTuple):
         ------
         UsageError
         """
-        sizes = {name: float(said[name]) for name in (*LENGTHS, "ssa") if said[name] is not None}
+        sizes = numbers({name: said[name] for name in (*LENGTHS, "ssa", "material_density")})
+        solid = sizes.pop("material_density", None)
         if len(sizes) > 1:
             words = " and ".join("--" + name.replace("_", "-") for name in sizes)
             raise UsageError(f"{words} each say how large the grains are: give one")
@@ -141,10 +162,37 @@ class Asked(NamedTuple):
             raise UsageError("give one GRAIN, or tables of one grain (NAME.tsdf.exr) at several indices")
         if any(tables) and said["settings"]:
             raise UsageError("--set shapes a GRAIN that is built, not one whose tables are given")
+        if any(tables) and said["fresnel"]:
+            raise UsageError("--fresnel is that of tables that are made of a GRAIN, not of those that are given")
         threads = said["threads"] or os.cpu_count() or 1
         material = said["material"] or own_material(grains if all(tables) else ())
-        return cls(grains, material, said["wavelength_nm"], sizes or dict([DEFAULT_SIZE]), said["settings"],
-                   said["table_paths"], threads)  # fmt: skip
+        asked = cls(grains, material, said["wavelength_nm"], sizes or dict([DEFAULT_SIZE]), solid, said["settings"],
+                    said["fresnel"] or "un", said["table_paths"], threads)  # fmt: skip
+        asked.need_density(*sizes)
+        return asked
+
+    def need_density(self, *words: str) -> None:
+        """Refuse words of mass where nobody says the density of what a grain, whose tables are not made yet, is of.
+
+        Raises
+        ------
+        UsageError
+        """
+        if not self.tabulated and "material_density" not in self.solid:
+            for word in ("ssa", "density"):
+                if word in words:
+                    raise UsageError(
+                        f"--{word} needs the density of the material, which is not known of {plain(self.material)}: "
+                        "say --material-density [kg/m3] too"
+                    )
+
+    @property
+    def solid(self) -> dict[str, float]:
+        """The density of the material by its word, where it is said or known of the constants."""
+        from tsdf.scene.sizes import DENSITIES, MATERIAL_DENSITY
+
+        density = self.material_density or DENSITIES.get(self.material)
+        return {} if density is None else {MATERIAL_DENSITY: density}
 
     @property
     def mesh(self) -> Path | None:
@@ -189,29 +237,25 @@ class Asked(NamedTuple):
         grain = load_grain(self.grains[0], False, **self.settings)
         paths = None if grain.kind == "sphere" else self.table_paths
         effort = Effort(paths, seed=seed, **records)
-        return spectra.build(grain, constants.n, effort, threads=self.threads, told=told)
+        return spectra.build(grain, constants.n, effort, threads=self.threads, fresnel=self.fresnel, told=told)
 
     @property
     def tabulated(self) -> bool:
         """Whether tables are given, and no grain."""
         return is_table(self.grains[0])
 
-    def words(self, family: "Family", solid: Mapping[str, float] | None = None, **amount: float) -> "InWords":
-        """Return sizes in metres, and how much of space is filled where that is said.
-
-        `solid` may hold the density of the material.
+    def words(self, family: "Family", **amount: float) -> "InWords":
+        """Return sizes in metres, and how much of space is filled where that is said, with or without room for spheres.
 
         Raises
         ------
         UsageError
         """
-        from tsdf.scene.sizes import DENSITIES, MATERIAL_DENSITY, convert
+        from tsdf.scene.sizes import convert
 
-        said = dict(self.sizes) | dict(solid or {}) | amount
-        if self.material in DENSITIES:
-            said = {MATERIAL_DENSITY: DENSITIES[self.material]} | said
+        said = dict(self.sizes) | self.solid | amount
         try:
-            return convert([(family.tables[0], 1.0)], said, 1.0, amount_needed=bool(amount))
+            return convert([(family.tables[0], 1.0)], said, 1.0, amount_needed=bool(amount), packed=False)
         except UsageError as error:
             raise UsageError(by_option(error)) from None
 
@@ -223,11 +267,35 @@ class Asked(NamedTuple):
         return size + (" (by default)" if self.sizes == dict([DEFAULT_SIZE]) else "")
 
 
-def check(asked: Asked, *outputs: Path | None) -> None:
-    """Refuse outputs that cannot be written, and pictures of no known kind, before any work is done."""
-    written = [path for path in outputs if path is not None]
-    if written:
-        check_output(written[0], *asked.inputs, beside=written[1:])
+def tables_of(family: "Family") -> str:
+    """Return which tables are taken, for notes."""
+    convention = str(family.tables[0].header["optics"]["fresnel"])
+    etas = ", ".join(f"{eta:.5g}" for eta in family.eta)
+    return f"tables at n = {etas}, Fresnel {convention} ({FRESNEL.get(convention, convention)})"
+
+
+def check(asked: Asked, as_json: bool, **outputs: Path | None) -> None:
+    """Refuse outputs that cannot be written, by the names of their options, before any work is done; texts may go to
+    standard output as `-`, one of them."""
+    given = [Output(f"--{name}", path, "" if name == "plot" else "- to print it") for name, path in outputs.items()
+             if path is not None]  # fmt: skip
+    printed = [f"{output.option} -" for output in given if is_printed(output.path)] + ["--json"] * as_json
+    if len(printed) > 1:
+        raise UsageError(f"{' and '.join(printed)} both go to standard output: give one, and the others files")
+    check_outputs([output for output in given if not is_printed(output.path)], *asked.inputs)
+
+
+def is_printed(path: Path | None) -> bool:
+    """Whether an output is to go to standard output."""
+    return path == Path("-")
+
+
+def write(path: Path | None, text: Callable[[], str]) -> None:
+    """Write a text where that is asked for, or print it."""
+    if is_printed(path):
+        click.echo(text(), nl=False)
+    elif path is not None:
+        write_text(path, text())
 
 
 Columns = Mapping[str, "np.ndarray"]
@@ -263,12 +331,8 @@ def text_table(columns: Columns, notes: Sequence[str]) -> str:
 def tell(
     columns: Columns, facts: Mapping[str, Any], notes: Sequence[str], as_json: bool, csv_file: Path | None, quiet: bool
 ) -> None:
-    """Print columns as JSON or for people, and write them as CSV where that is asked for."""
-    from tsdf.files import replacing
-
-    if csv_file is not None:
-        with replacing(csv_file) as temporary:
-            temporary.write_text(csv_text(columns, notes), encoding="utf-8")
+    """Print columns as JSON or for people, and write them as CSV where that is asked for; with `quiet` print none."""
+    write(csv_file, lambda: csv_text(columns, notes))
     if as_json:
         values = {name: [number(value) for value in column] for name, column in columns.items()}
         click.echo(json.dumps({**facts, "notes": list(notes), **values}))

@@ -32,7 +32,7 @@ def main(files: tuple[str, ...], as_json: bool, structure: bool, plot: str | Non
         plots.check_suffix(plot)
         if len(files) != 1 or structure:
             raise UsageError("--plot draws one FILE, checked in full")
-        check_output(Path(plot), Path(files[0]))
+        check_output(Path(plot), Path(files[0]), option="--plot")
     from tsdf.judge.validate import validate
 
     reports, failed = [], False

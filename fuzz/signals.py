@@ -27,6 +27,7 @@ ANSWER_S = 2.0
 SCENE = ROOT / "tests" / "ball.toml"
 COMMANDS = {
     "accuracy": "cube.tsdf.exr --out folder --packing 0.1 --seconds 1000",
+    "albedo": "cube.tsdf.exr --thickness 10mm --error 1e-5 --csv new.csv",
     "build": "cube --eta 1.31 --paths 1e9 --out new.exr",
     "export": "cube.tsdf.exr --to csv --packing 0.3 --radius 1 --out new.csv",
     "frontier": "scene.toml --out folder --seconds 1000",

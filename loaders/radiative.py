@@ -141,7 +141,7 @@ def disort(request: Request) -> str:
 def phase(request: Request) -> str:
     """Return phase functions by wavelength as text, mean over the sphere 1."""
     found = request.found
-    edges, masses = request.family.masses(found.constants.n, np.nan_to_num(found.absorption_times_radius))
+    edges, masses = request.family.masses(found)
     heads = wavelength_heads(found.constants) if found.constants.material else ["p"]
     return phase_text(edges, masses, heads, request.notes)
 
@@ -184,7 +184,7 @@ def write_eradiate(request: Request, path: str | os.PathLike[str]) -> None:
     """
     request.known("Eradiate")
     found = request.found
-    edges, masses = request.family.masses(found.constants.n, found.absorption_times_radius)
+    edges, masses = request.family.masses(found)
     mu, density = _linear(edges, masses)
     w = len(found.albedo)
     with replacing(path) as temporary:

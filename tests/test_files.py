@@ -89,6 +89,30 @@ def test_what_meshes_name(tmp_path: Path) -> None:
     assert time.process_time() - begun < 2.0
 
 
+def test_streams_are_told_from_files(tmp_path: Path) -> None:
+    """By what a name leads through; files, folders, what is not there yet and links in circles are none."""
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "file").touch()
+    links = {
+        "a": "/dev/stdout",
+        "b": "a",
+        "c": "/proc/self/fd",
+        "d": "fifo",
+        "e": "file",
+        "f": "none",
+        "g": "h",
+        "h": "g",
+    }
+    for name, target in links.items():
+        (tmp_path / name).symlink_to(target)
+    for name in ("a", "b", "c/1", "c/x.csv", "d", "fifo", "/dev/stderr", "/dev/fd/2", "/dev/null", "/proc/self/fd/1"):
+        assert files.is_stream(tmp_path / name), name
+        with pytest.raises(TSDFError, match="a stream"):
+            write(tmp_path / name)
+    for name in ("file", "e", "f", "g", "none", "none/x", ".", ""):
+        assert not files.is_stream(tmp_path / name), name
+
+
 def test_only_regular_files(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo")
     for path in (tmp_path, tmp_path / "fifo", Path("/dev/full"), tmp_path / "none" / "a"):

@@ -33,6 +33,7 @@ _NAMES = {  # how they name them; of a line of materials the last word is one
     ".obj": rb"(?m)^[ \t]*mtllib[ \t]+([^\r\n]{1,1024})",
     ".mtl": rb"(?m)^[ \t]*(?:map_\w{1,16}|bump|disp|decal|refl|norm)[ \t]([^\r\n]{1,1024})",
 }
+MOST_LINKS = 40  # that are followed from a name to what it leads to
 MAX_NAME = 255  # [bytes] of the name of a file on common file systems
 
 whole = threading.RLock()  # held while files are written that nothing tidies up: take it before ending the process
@@ -62,6 +63,28 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise TSDFError(
             f"cannot write {os.fspath(path)}: {reason}; check the folder, the permissions and the free space"
         ) from error
+
+
+def is_stream(path: str | os.PathLike[str]) -> bool:
+    """Tell whether a path is a pipe, a terminal or another device, or leads through one of this process's streams.
+
+    Where standard output is redirected to a file, /dev/stdout leads to it, and the file would be replaced by what was
+    meant to be added to it.
+    """
+    here = Path(path).absolute()
+    for _ in range(MOST_LINKS):
+        here = Path(os.path.realpath(here.parent)) / here.name
+        if here.parts[:2] == ("/", "proc") or str(here.parent) in ("/dev", "/dev/fd"):
+            return True
+        try:
+            here = here.parent / os.readlink(here)
+        except OSError:
+            break
+    try:
+        mode = here.stat().st_mode
+    except OSError:
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
 
 
 def probe(path: str | os.PathLike[str]) -> None:
@@ -132,8 +155,10 @@ def _target(path: str | os.PathLike[str]) -> Path:
     Raises
     ------
     OSError
-        For what is there and not a regular file, or for a name that is too long.
+        For what is there and not a regular file, for streams, or for a name that is too long.
     """
+    if is_stream(path):
+        raise OSError("it is no regular file but a stream (screen, pipe or device)")
     target = Path(os.path.realpath(path))
     with contextlib.suppress(FileNotFoundError):
         if not stat.S_ISREG(target.stat().st_mode):

@@ -2,6 +2,8 @@
 
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -212,9 +214,14 @@ def test_what_cannot_be_written(command: str, inputs: Path, monkeypatch: pytest.
     os.mkfifo(inputs / f"fifo{suffix}")
     (inputs / f"folder{suffix}").mkdir()
     (inputs / f"link{suffix}").symlink_to(inputs / "none" / f"x{suffix}")
+    (inputs / f"screen{suffix}").symlink_to("/dev/stdout")
+    (inputs / "streams").symlink_to("/proc/self/fd")
     before = contents(inputs)
     for name, status, said in (
-        (f"fifo{suffix}", 1, "regular file"),
+        (f"fifo{suffix}", 1, "no regular file but a stream"),
+        (f"screen{suffix}", 1, "no regular file but a stream"),
+        (f"streams/1{suffix}", 1, "no regular file but a stream"),
+        (f"/dev/stdout{suffix}", 1, "no regular file but a stream"),
         (f"folder{suffix}", 1, "regular file"),
         (f"link{suffix}", 1, "is not a folder"),
         (f"none/x{suffix}", 1, "is not a folder"),
@@ -227,10 +234,27 @@ def test_what_cannot_be_written(command: str, inputs: Path, monkeypatch: pytest.
         result = invoke(*words, inputs / name)
         assert result.exit_code == status and result.stdout == "" and result.stderr.count("\n") == 1, (name, result)
         assert "cannot write" in result.stderr and said in result.stderr
+        assert ("--plot" if command == "validate" else "--out") in result.stderr
     monkeypatch.setattr(Path, "write_bytes", full)
     result = invoke(*words, inputs / f"x{suffix}")
     assert result.exit_code == 1 and "No space left" in result.stderr and result.stderr.count("\n") == 1
     assert contents(inputs) == before
+
+
+def test_what_standard_output_goes_to_stays(inputs: Path) -> None:
+    """A log to which a command's output is added is not replaced by a file that is named like its stream, whatever name
+    that goes by."""
+    log = inputs / "log"
+    (inputs / "to").symlink_to("/dev/stdout")
+    command = [sys.executable, "-c", "from tsdf.cli.export import main; main()", inputs / "table.exr", *MEDIUM]
+    for name in ("/dev/stdout", "/dev/fd/1", inputs / "to"):
+        log.write_text("kept\n")
+        with log.open("a") as stdout:
+            done = subprocess.run(
+                [*command, "--to", "csv", "--out", name], stdout=stdout, stderr=subprocess.PIPE, text=True, check=False
+            )  # fmt: skip
+        assert done.returncode == 1 and log.read_text() == "kept\n"
+        assert done.stderr.count("\n") == 1 and "choose another --out, or leave it out" in done.stderr
 
 
 def full(*_: object) -> None:

@@ -93,7 +93,7 @@ def test_info_of_a_colour():
     assert [deep_colour(tsdf_format.read(SPHERE), x) for x in by_radius] == pytest.approx([0.9, 0.5, 0.2], abs=1e-6)
     assert colour["absorption"] == pytest.approx([x / 2.0 for x in by_radius])
     assert colour["absorption_per_metre"] == pytest.approx([x / 2e-3 for x in by_radius])
-    units = {"R": 1.0, "unit": 2.0, "m": 2e-3}
+    units = {"R": 1.0, "mm": 2.0, "m": 2e-3}
     said = " = ".join(f"{', '.join(f'{x / by:.4g}' for x in by_radius)} / {unit}" for unit, by in units.items())
     assert said in run(info, SPHERE, *options).stdout
     thin = ("--colour-thickness", "20", "--packing", "0.6")
@@ -140,7 +140,8 @@ def test_absorption_has_a_unit(given, options, product):
         assert facts["absorption"] is None
     else:
         assert facts["absorption"] == pytest.approx(product / float(radius), rel=1e-12)
-        assert f"{product:g} / R, {product / float(radius):g} / unit," in text
+        unit = {"1e-3": "mm", "1": "m", "1e-6": "um"}.get(options[3], "unit") if "--unit" in options else "unit"
+        assert f"{product:g} / R, {product / float(radius):g} / {unit}," in text
 
 
 def test_a_bare_absorption_is_over_R():
@@ -184,6 +185,11 @@ def test_medium_of_packed_grains():
     assert all(scaled[name] == pytest.approx(value) for name, value in numbers.items())
     text = run(info, CUBE, *options).stdout
     assert f"{0.001 * path.lambda_beta:.6g} units" in text and f"{1000.0 * volume.sigma_t:.6g} / unit\n" in text
+    for said in (("--radius", "1um"), ("--radius", "1", "--unit", "1e-6")):
+        text = run(info, CUBE, *options[:4], *said).stdout
+        assert f"{path.lambda_beta:.6g} um\n" in text and f"{volume.sigma_t:.6g} / um\n" in text
+        assert f"{tsdf_format.read(CUBE).projected_area.value:.6g}" in text and " um^2\n" in text
+        assert " units" not in text and "/ unit" not in text
     text = run(info, SPHERE, "--packing", "0.6").stdout
     assert "lambda_b             0.888889 R\n" in text and "sigma_a              0 / R\n" in text
     assert "medium" not in run(info, CUBE).stdout and "medium" not in json.loads(run(info, CUBE, "--json").stdout)

@@ -62,6 +62,24 @@ def test_k_may_be_unknown(tmp_path: Path) -> None:
     assert constants_of(some, 550).k == pytest.approx(0.01)
 
 
+def test_a_row_of_no_k_is_left_in_a_straight_line_and_said(tmp_path: Path) -> None:
+    """Only beside it, and the source says where; between other rows, on rows and without such a row log k is linear."""
+    text = "wavelength_nm,n,k\n400,1.3,0\n500,1.3,{}\n1000,1.3,1e-6\n1200,1.3,1e-4\n"
+    none, little = (file(tmp_path, text.format(k), f"{k}.csv") for k in ("0", "1e-12"))
+    for name, k in ((none, 4e-7), (little, 10 ** (-12 + 6 * 0.4))):
+        found = constants.constants_over(name, [450.0, 700.0, 800.0, 1000.0, 1100.0])
+        assert found[1].k == pytest.approx(k, rel=1e-9) and found[4].k == pytest.approx(1e-5, rel=1e-9), name
+    assert constants.constants_over(none, [450.0])[0].k == 0.0
+    linear = "; k at {} nm is linear from a row of k = 0 to the next"
+    for name, asked, said in (
+        (none, [450.0, 700.0, 800.0], linear.format("700 to 800")), (none, [700.0, 1100.0], linear.format("700")),
+        (none, [500.0, 1000.0, 1100.0], ""), (little, [450.0], linear.format("450")), (little, [700.0, 1100.0], ""),
+    ):  # fmt: skip
+        sources = {found.source for found in constants.constants_over(name, asked)}
+        assert len(sources) == 1 and sources.pop().startswith(f"file {Path(name).name}{said}"), (name, asked)
+        assert said or constants_of(name, asked[0]).source == f"file {Path(name).name}"
+
+
 # (formula, coefficients, wavelength [um], n): numbers of the sources, and formulas of round numbers by hand
 FORMULAS = [
     (1, "0 1.03961212 0.0774642 0.231792344 0.1414846 1.01046945 10.1764754", 0.5875618, 1.5168, 5e-5),  # N-BK7

@@ -131,9 +131,14 @@ def test_too_dense_says_what_it_would_take(cube):
         convert([(cube, 1.0)], {"density": 1.5 * most})
     text = str(caught.value)
     path = volume_parameters([Component(cube)], 0.64).transport_mean_free_path
-    for part in (f"fraction of {0.96:g}", f"{most:.3g} kg/m3", f"{path:.3g} R", "about 1.5 times", "0.667 times"):
+    for part in (f"fraction of {0.96:g}", f"{most:.3g} kg/m3", f"{path:.3g} R", "about 1.5 times", "1.5 times as thick",
+                 "0.667 times as large where absorption is said by colour or over R"):  # fmt: skip
         assert part in text
     assert "\n" not in text
+    loose = convert([(cube, 1.0)], {"density": 1.5 * most}, packed=False)  # where spheres need no room
+    assert loose.packing_fraction == pytest.approx(0.96) and loose.density == pytest.approx(1.5 * most)
+    with pytest.raises(UsageError, match="more than that of the material"):
+        convert([(cube, 1.0)], {"density": 918.0}, packed=False)
     with pytest.raises(UsageError, match=r"solid_fraction 0\.4 of cube would take a packing fraction of 1\.09"):
         convert([(cube, 1.0)], {"solid_fraction": 0.4})
 

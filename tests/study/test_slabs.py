@@ -66,6 +66,8 @@ def test_discrete_ordinates(family: Family, found: Spectrum, thickness: float, m
             family, replace(c, wavelength_nm=c.wavelength_nm[some], n=c.n[some], k=c.k[some]), RADIUS
         )
     got = slabs.measure(family, found, Request("volume", FRACTION, thickness, mu), 9e-4, threads=2)
+    off = np.abs(got.reflectance - got.theories.doubled.reflectance)
+    assert (off < SIGMAS * got.reflectance_error + got.theories.between).all(), off
     moments, _ = spectra.moments_of(family, found, 64)
     weights = family.weights(found.constants.n)
     sigma = np.array([slabs.extinction(table, FRACTION, found.albedo) for table in family.tables])
@@ -155,6 +157,29 @@ def test_the_same_for_any_number_of_threads(family: Family, found: Spectrum) -> 
 
 
 @pytest.mark.slow
+def test_what_is_stopped_tells_what_it_has_with_its_error(family: Family, found: Spectrum) -> None:
+    """Not before each set has its first paths; then in the middle of a set, so that one has more of them than another,
+    what is told is that slab by doubling, within errors that are those of so few paths."""
+    request = Request("volume", FRACTION, 10.0, 0.7)
+    first = slabs.measure(family, found, request, 1e-5, threads=2, goes_on=lambda paths: False)
+    whole = slabs.measure(family, found, request, threads=2, paths=slabs.FEWEST)
+    assert first.paths == slabs.FEWEST and np.array_equal(first.reflectance, whole.reflectance)
+    heard: list[int] = []
+
+    def goes_on(paths: int) -> bool:
+        heard.append(paths)
+        return heard.count(slabs.FEWEST) < 8
+
+    some = slabs.measure(family, found, request, 1e-5, threads=2, goes_on=goes_on)
+    assert some.paths == slabs.FEWEST and set(heard) == {slabs.FEWEST}
+    assert not np.array_equal(some.reflectance, whole.reflectance)
+    for got in (first, some):
+        off = np.abs(np.stack([got.reflectance, got.transmittance]) - np.stack(got.theories.doubled))
+        error = np.stack([got.reflectance_error, got.transmittance_error])
+        assert (off < SIGMAS * error + 5e-4).all() and error[:, 2].min() > 1e-3 and error.max() < 5e-3
+
+
+@pytest.mark.slow
 def test_thinned_paths_are_unbiased(family: Family, found: Spectrum, monkeypatch: pytest.MonkeyPatch) -> None:
     """Long paths thinned, as with a profile, against paths that are all followed to their end, and against leaps: the
     same, but noisier where light comes back nearly whole. A share that is not made up for would take a tenth of it."""
@@ -212,6 +237,32 @@ def test_two_streams_near_discrete_ordinates(cosine: float | None) -> None:
         if albedo == 1.0 and cosine != 0.3:
             simple = streams.asymptotic(np.array([tau]), np.array([0.0]), np.array([g]), cosine)
             assert np.abs(np.array(simple)[:, 0] - truth).max() < 0.015
+
+
+@pytest.mark.parametrize("cosine", [1.0, 0.3])
+@pytest.mark.parametrize("tau", [0.1, 4.0, 300.0])
+def test_doubling_is_discrete_ordinates(tau: float, cosine: float) -> None:
+    """Another method with other directions: within 2e-4; a slab 2 % thicker is not, nor one of g .02 more."""
+    g, albedo = np.array([0.0, 0.75, 0.9]), np.array([0.5, 0.999, 1.0 - 1e-9])
+    got = np.array(streams.doubled(np.full(3, tau), albedo, g[:, None] ** np.arange(streams.ORDERS + 1), cosine)).T
+    truth = np.array([disort(tau, w, one ** np.arange(65.0), cosine) for w, one in zip(albedo, g, strict=True)])
+    assert np.abs(got - truth).max() < 2e-4
+    other = np.minimum(g + 0.02, 1.0)[:, None] ** np.arange(streams.ORDERS + 1)
+    assert np.abs(np.array(streams.doubled(np.full(3, tau), albedo, other, cosine)).T - truth).max() > 4e-4
+
+
+def test_doubling_of_diffuse_light() -> None:
+    """It is the mean over beams; a lossless slab loses nothing, and a half-space of it is white."""
+    moments = np.array([0.8, 0.5])[:, None] ** np.arange(streams.ORDERS + 1)
+    at, weight = np.polynomial.legendre.leggauss(32)
+    mu, weight = 0.5 * (at + 1.0), 0.5 * weight
+    tau, albedo = np.array([5.0, math.inf]), np.array([1.0, 0.9])
+    beams = np.array([streams.doubled(tau, albedo, moments, m) for m in mu])
+    mean = np.einsum("m,msw->sw", 2.0 * weight * mu, beams)
+    got = np.array(streams.doubled(tau, albedo, moments, None))
+    assert np.abs(got - mean).max() < 2e-5
+    assert got[:, 0].sum() == pytest.approx(1.0, abs=1e-6) and got[1, 1] == 0.0
+    assert streams.doubled(np.full(1, math.inf), np.ones(1), moments[:1], None).reflectance[0] > 0.999
 
 
 # ------------------------------------------------------------------------------------------------ bad input

@@ -83,7 +83,7 @@ def test_moments_between_tables_are_no_clipped_polynomials(ice: Constants, famil
     the phase functions for reading are nowhere negative."""
     moments, _ = spectra.moments_of(family, found, 1)
     assert moments[:, 1] == pytest.approx(found.g, abs=2e-4)
-    _, masses = family.masses(ice.n, found.absorption_times_radius)
+    _, masses = family.masses(found)
     assert masses.min() >= 0.0 and masses.sum(axis=1) == pytest.approx(np.ones(len(ice.n)))
 
 
@@ -106,22 +106,6 @@ def test_k_that_is_not_known_is_no_absorption_of_zero() -> None:
     assert any("k of quartz is not known at 2 of 2" in note for note in found.notes)
 
 
-def test_dark_surfaces_are_told() -> None:
-    """At 3 um ice reflects by its k as well, which tables leave out: the error of the albedo has the difference."""
-    ice = Constants.of(constants_over("ice", [3100.0]))
-    found = spectra.spectrum(Family(found_tables(float(ice.n[0]))), ice, RADIUS)
-    whole = spectra.diffuse_reflectance(ice.n, ice.k)[0]
-    assert abs(found.albedo[0] - whole) <= found.error("albedo")[0] + 1e-4
-    assert abs(found.albedo[0] - whole) > 1e-3
-    assert "changes the reflectance of the surface" in found.notes[0]
-    # of a mirror, and of a clear surface by its own formula
-    assert spectra.diffuse_reflectance(np.array([1e-3]), np.array([1e4]))[0] > 0.99
-    angles = np.cos(np.linspace(0.0, np.pi / 2.0, 20_001))
-    s, p = analytic.fresnel_reflectance(angles, 1.31)
-    mean = np.trapezoid((0.5 * (s + p) * 2.0 * angles)[::-1], angles[::-1])
-    assert spectra.diffuse_reflectance(np.array([1.31]), np.array([0.0]))[0] == pytest.approx(mean, abs=1e-5)
-
-
 @pytest.mark.parametrize(
     ("text", "count", "last"), [("550", 1, 550.0), ("600,400", 2, 600.0), ("300:2500:10", 221, 2500.0),
                                 ("300:310:4", 3, 308.0), ("0.5:0.6:0.1", 2, 0.6)],
@@ -137,6 +121,13 @@ def test_wavelengths_that_are_none(text: str) -> None:
         spectra.wavelengths(text)
 
 
+def test_wavelengths_that_fall() -> None:
+    for text in ("5000:200:-1000", "5000:200:1000", "200:5000:-10", "200:5000:0"):
+        with pytest.raises(UsageError, match="FROM:TO:STEP rises"):
+            spectra.wavelengths(text)
+    assert spectra.wavelengths("300:300:10").tolist() == [300.0]
+
+
 @pytest.mark.slow
 def test_tables_that_make_no_family(ice: Constants) -> None:
     ball = found_tables(1.3, 1.31)
@@ -145,6 +136,9 @@ def test_tables_that_make_no_family(ice: Constants) -> None:
     build.run(cube)
     with pytest.raises(UsageError, match="different grains"):
         Family.of([*ball, build.table()])
+    apart = scatterometer.exact_sphere(load_grain("sphere"), Optics(1.32, "sp"), Effort())
+    with pytest.raises(UsageError, match="--fresnel sp and --fresnel un"):
+        Family.of([*ball, apart])
     with pytest.raises(UsageError, match="the same index"):
         Family.of([ball[0], ball[0]])
     with pytest.raises(UsageError, match="add tables at the ends"):

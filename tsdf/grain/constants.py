@@ -8,11 +8,12 @@ import math
 import re
 import stat
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from tsdf.errors import TSDFError, UsageError
-from tsdf.grain.materials import MATERIALS, Medium, OpticalConstants, optical_constants, table_k, table_n
+from tsdf.grain.materials import MATERIALS, Medium, OpticalConstants, TableK, optical_constants, table_n
 
 LARGEST = 4_000_000  # bytes of a file; the largest of refractiveindex.info has 2e6
 INDEX = (1e-30, 1e30)  # that a table may have (schema/SPEC.md), as `optics.ETA`; and k at most
@@ -37,12 +38,21 @@ def constants_of(material: str, wavelength_nm: float) -> OpticalConstants:
 
 
 def constants_over(material: str, wavelengths_nm: Iterable[float]) -> list[OpticalConstants]:
-    """Return n and k as `constants_of` does, at several wavelengths; a file is read once."""
+    """Return n and k as `constants_of` does, at several wavelengths; a file is read once.
+
+    Where k of a file is on a straight line between a row of 0 and a number, `source` says so.
+    """
     path = Path(material)
     if material in MATERIALS or not (path.suffix or path.exists()):
         return [optical_constants(material, wavelength) for wavelength in wavelengths_nm]
     medium, k_range_nm = read(path)
-    return [_at(path, medium, k_range_nm, float(wavelength)) for wavelength in wavelengths_nm]
+    wavelengths = [float(wavelength) for wavelength in wavelengths_nm]
+    found = [_at(path, medium, k_range_nm, wavelength) for wavelength in wavelengths]
+    if isinstance(medium.k, TableK) and (faint := [w for w in wavelengths if medium.k.from_zero(w)]):
+        where = f"{min(faint):g}" + (f" to {max(faint):g}" if len(faint) > 1 else "")
+        said = f"{medium.source}; k at {where} nm is linear from a row of k = 0 to the next, elsewhere log k is"
+        found = [replace(one, source=said) for one in found]
+    return found
 
 
 def _at(path: Path, medium: Medium, k_range_nm: tuple[float, float], wavelength_nm: float) -> OpticalConstants:
@@ -108,7 +118,7 @@ def _table(rows: Rows, quantity: str, lenient: bool = False) -> Span:
             raise ValueError(f"two values of {quantity} at {wavelength:g} nm")
     nodes = sorted(known)
     values = [known[node] for node in nodes]
-    return (nodes[0], nodes[-1]), (table_n if quantity == "n" else table_k)(nodes, values)
+    return (nodes[0], nodes[-1]), (table_n if quantity == "n" else TableK)(nodes, values)
 
 
 def _line(text: str, length: int = 300) -> str:

@@ -5,7 +5,8 @@ meets a surface is `optics`. The numbers are those of the refractiveindex.info d
 from the sources named in `MEDIA`; sucrose is not in it. k is None where the source gives none, which is not
 k = 0. Between the nodes of a table log k is linear in wavelength, and n in 1/wavelength^2, as normal
 dispersion nearly is: that holds n of ice to 1e-4 from 350 to 390 nm, where linear in wavelength would miss
-by 2e-4. A user's own constants are read by `constants`. Crystals are taken as isotropic: birefringence is ignored.
+by 2e-4. Next to a node of k = 0 it is k that is linear. A user's own constants are read by `constants`.
+Crystals are taken as isotropic: birefringence is ignored.
 """
 
 import math
@@ -208,15 +209,30 @@ def table_n(nodes_nm: Sequence[float], values: Sequence[float]) -> Callable[[flo
     return lambda wavelength_nm: float(np.interp(-1.0 / wavelength_nm**2, abscissae, values))
 
 
-def table_k(nodes_nm: Sequence[float], values: Sequence[float]) -> Callable[[float], float]:
-    """Return k as a function of the wavelength [nm], log k linear in wavelength between ascending nodes.
+class TableK:
+    """k as a function of the wavelength [nm], log k linear in wavelength between ascending nodes.
 
-    Where k of a node is 0 it is k that is linear.
+    Between a node where k is 0, which has no logarithm, and its neighbours it is k that is linear.
     """
-    if min(values) <= 0.0:
-        return lambda wavelength_nm: float(np.interp(wavelength_nm, nodes_nm, values))
-    logs = np.log(values)
-    return lambda wavelength_nm: math.exp(np.interp(wavelength_nm, nodes_nm, logs))
+
+    def __init__(self, nodes_nm: Sequence[float], values: Sequence[float]) -> None:
+        self.nodes_nm, self.values = np.array(nodes_nm, np.float64), np.array(values, np.float64)
+        self._logs = np.log(np.where(self.values > 0.0, self.values, 1.0))
+
+    def __call__(self, wavelength_nm: float) -> float:
+        """Return k [1]; beyond the nodes that of the last."""
+        straight = float(np.interp(wavelength_nm, self.nodes_nm, self.values))
+        if straight == 0.0 or self.from_zero(wavelength_nm):
+            return straight
+        return math.exp(np.interp(wavelength_nm, self.nodes_nm, self._logs))
+
+    def from_zero(self, wavelength_nm: float) -> bool:
+        """Whether k at a wavelength [nm] is on the straight line between a node of 0 and one of a number."""
+        i = int(np.searchsorted(self.nodes_nm, wavelength_nm))
+        if not 0 < i < len(self.nodes_nm) or self.nodes_nm[i] == wavelength_nm:
+            return False
+        low, high = sorted(self.values[i - 1 : i + 1])
+        return bool(low <= 0.0 < high)
 
 
 def quartz_n(wavelength_nm: float) -> float:
@@ -242,13 +258,13 @@ MEDIA = {
     "ice": Medium(
         (200.0, 5000.0),
         table_n(ICE_NODES_NM, ICE_N),
-        table_k(ICE_NODES_NM, ICE_K),
+        TableK(ICE_NODES_NM, ICE_K),
         "Warren & Brandt 2008, doi:10.1029/2007JD009744, 266 K; birefringence ignored",
     ),
     "water": Medium(
         (200.0, 4000.0),
         water_n,
-        table_k(WATER_NODES_NM, WATER_K),
+        TableK(WATER_NODES_NM, WATER_K),
         "n Daimon & Masumura 2007, doi:10.1364/AO.46.003811, 20 C, beyond 1100 nm Hale & Querry; "
         "k Hale & Querry 1973, doi:10.1364/AO.12.000555, 25 C, beyond 1000 nm Segelstein 1981, hdl:10355/11599",
     ),
@@ -263,7 +279,7 @@ MEDIA = {
     "glass": Medium(
         (300.0, 2500.0),
         sellmeier_n(GLASS_TERMS),
-        table_k(GLASS_NODES_NM, GLASS_K),
+        TableK(GLASS_NODES_NM, GLASS_K),
         "Schott N-BK7, catalogue 2017-01-20, 293 K",
     ),
     "sucrose": Medium(

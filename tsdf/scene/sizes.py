@@ -195,6 +195,7 @@ def convert(
     said: Mapping[str, float],
     metres_per_unit: float | None = None,
     amount_needed: bool = True,
+    packed: bool = True,
 ) -> InWords:
     """Return bounding radius and packing fraction of grains of which somebody says size and amount in any words.
 
@@ -209,13 +210,16 @@ def convert(
         Length of the scene unit [m]; only ssa needs it.
     amount_needed : bool
         Whether one of `AMOUNTS` must be there.
+    packed : bool
+        Whether bounding spheres are to be packed; if not, any solid fraction up to 1 is taken, and the packing fraction
+        may be more than spheres can have.
 
     Raises
     ------
     UsageError
-        In one line: for no such words or two of a kind, for what the table or the caller does not say, and for
-        solid fractions and densities of which the bounding spheres could not be packed (`DENSEST_RANDOM`), with
-        the nearest that can.
+        In one line: for no such words or two of a kind, for what the table or the caller does not say, and, if
+        spheres are to be packed, for solid fractions and densities at which they cannot be (`DENSEST_RANDOM`), with
+        the way out.
     """
     check_words(said, amount_needed)
     sizes = grain_sizes(grains, said.get(MATERIAL_DENSITY))
@@ -241,7 +245,7 @@ def convert(
             )
     if not solid <= 1.0:
         raise UsageError(f"solid_fraction is a share of space, at most 1, not {solid:g}")
-    if solid / sizes.solid_share > DENSEST_RANDOM:
+    if packed and solid / sizes.solid_share > DENSEST_RANDOM:
         raise UsageError(_too_dense(grains, sizes, amount, fraction, solid / sizes.solid_share))
     return InWords(sizes, solid / sizes.solid_share, radius, metres_per_unit)
 
@@ -297,6 +301,18 @@ def _known_density(sizes: GrainSizes, word: str) -> float:
     return sizes.material_density
 
 
+def unpackable(sizes: GrainSizes, amount: str, value: float, wanted: float) -> str:
+    """Return what an amount of grains would take whose bounding spheres cannot be packed so, as the part of a line."""
+    most = InWords(sizes, DENSEST_RANDOM, 1.0)
+    densest = most.solid_fraction if amount == "solid_fraction" else most.density
+    unit = " kg/m3" if amount == "density" else ""
+    return (
+        f"{amount} {value:g}{unit} of {sizes.name} would take a packing fraction of {wanted:.3g}: the grain fills "
+        f"{sizes.solid_share:.3g} of its bounding sphere, and spheres thrown together at most {DENSEST_RANDOM:g} of "
+        f"space, which is {amount} {densest:.3g}{unit}"
+    )
+
+
 def _too_dense(
     grains: Sequence[tuple[Table, float]], sizes: GrainSizes, amount: str, value: float, wanted: float
 ) -> str:
@@ -304,15 +320,11 @@ def _too_dense(
 
     Mean free paths fall as 1/density: a void and a grain together are V / (A solid_fraction) long in the mean.
     """
-    most = InWords(sizes, DENSEST_RANDOM, 1.0)
-    densest = most.solid_fraction if amount == "solid_fraction" else most.density
     path = volume_parameters([Component(table, share) for table, share in grains], DENSEST_RANDOM)
     longer = wanted / DENSEST_RANDOM
-    unit = " kg/m3" if amount == "density" else ""
     return (
-        f"{amount} {value:g}{unit} of {sizes.name} would take a packing fraction of {wanted:.3g}: the grain fills "
-        f"{sizes.solid_share:.3g} of its bounding sphere, and spheres thrown together at most {DENSEST_RANDOM:g} of "
-        f"space, which is {amount} {densest:.3g}{unit}. Say packing_fraction = {DENSEST_RANDOM:g}: its transport mean "
-        f"free path, {path.transport_mean_free_path:.3g} R, is about {longer:.3g} times that of this {amount}; "
-        f"grains {1.0 / longer:.3g} times as large make up for it"
+        f"{unpackable(sizes, amount, value, wanted)}. Say packing_fraction = {DENSEST_RANDOM:g}: its transport mean "
+        f"free path, {path.transport_mean_free_path:.3g} R, is about {longer:.3g} times that of this {amount}; the "
+        f"same grains in a body {longer:.3g} times as thick make up for it, and grains {1.0 / longer:.3g} times as "
+        "large where absorption is said by colour or over R (that of a material is per length: keep their size)"
     )

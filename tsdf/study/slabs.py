@@ -4,7 +4,8 @@ A path keeps the length of grain material it went through, so exp(-sigma_a lengt
 wavelength; it is followed with the absorption of the wavelength that is absorbed least. Only n cannot be changed
 afterwards: paths are followed at the index of up to three tables of a family, the rest is their polynomial. Ground
 under the slab is added exactly, from what the slab does to diffuse light. Deep down paths leap; where they cannot, few
-of the long ones are followed to their end (`_thin`). Approximations to compare with are `streams`.
+of the long ones are followed to their end (`_thin`). What k makes of the surface of grains paths do not know; it is put
+in by doubling. Theories to compare with are `streams`.
 """
 
 import math
@@ -13,6 +14,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,12 +29,13 @@ from tsdf.scene.medium import Component, free_path, volume_parameters
 from tsdf.scene.scene import Absorption, GrainSpec, Slab
 from tsdf.study import streams
 from tsdf.study.experiment import WIDE, scene_of, trips
-from tsdf.study.spectra import Family, Spectrum, absorbed, lagrange
+from tsdf.study.spectra import Family, Spectrum, absorbed, lagrange, moments_of
 from tsdf.walk import transport
 
 GROUPS = 32  # of paths, whose spread tells the error
 CHUNK = 4096  # paths that one thread follows at a time
 FEWEST, MOST = 1 << 14, 1 << 24  # paths of a set
+SPREAD = 0.4  # of what a path gives: a guess for how many it takes, before any is followed
 DEEP = 30.0  # decay lengths of the least absorbed light from which on a slab is a half-space
 FEEBLE = 1e-9  # co-albedo below which a half-space cannot be told from one that absorbs nothing
 CLEAR = 5.0  # [R] above the slab where light starts
@@ -109,10 +112,9 @@ class Albedo:
     Attributes
     ----------
     reflectance, transmittance : transmittance is what reaches the ground, again and again.
-    reflectance_error, transmittance_error : statistical, one standard error.
-    between : what the polynomial in n may miss of the reflectance, by two streams.
-    two_streams, asymptotic : Streams
-        The same slab by the theories.
+    reflectance_error, transmittance_error : one standard error, and what is not known of surfaces with k.
+    theories : Theories
+        Of the same slab, and what the polynomial in n may miss of the reflectance.
     profile, profile_error : (depths, w) absorbed in each layer; in a grain it counts where light leaves it
     edges : (depths + 1,) float64 depths of the layers' ends [R]
     paths : int
@@ -127,9 +129,7 @@ class Albedo:
     transmittance: np.ndarray
     reflectance_error: np.ndarray
     transmittance_error: np.ndarray
-    between: np.ndarray
-    two_streams: streams.Streams
-    asymptotic: streams.Streams
+    theories: "Theories"
     profile: np.ndarray
     profile_error: np.ndarray
     edges: np.ndarray
@@ -390,6 +390,7 @@ def measure(
     threads: int | None = None,
     paths: int | None = None,
     told: Callable[[float, str], None] = lambda share, word: None,
+    goes_on: Callable[[int], bool] = lambda paths: True,
 ) -> Albedo:
     """Return what a slab does to light at the wavelengths of a spectrum.
 
@@ -409,6 +410,9 @@ def measure(
         Of each set, instead of a target.
     told : callable
         Called with the share done, in [0, 1], and a word about it.
+    goes_on : callable
+        Called now and then with the number of paths that each set has had at least; tells whether to follow more. It is
+        not heeded as long as that is 0.
 
     Raises
     ------
@@ -428,7 +432,7 @@ def measure(
         )
     which = chosen(family)
     eta = family.eta[which]
-    weights = lagrange(eta, n)
+    weights, theories = lagrange(eta, n), _theories(family, found, request, which)
     sets = [
         [Paths.start(family.tables[t], request, light, x, len(request.lights) * number + k) for number, t in
          enumerate(which)] for k, light in enumerate(request.lights)
@@ -443,6 +447,9 @@ def measure(
         if request.ground > 0.0 and math.isfinite(request.thickness):
             whole = streams.over_ground(light, diffuse, request.ground)
             profile = layers[0] + request.ground * whole.transmittance * layers[-1][::-1]
+        whole = streams.Streams(
+            *(np.clip(of + more, 0.0, 1.0) for of, more in zip(whole, theories.surface, strict=True))
+        )
         if len(profile) and math.isfinite(
             request.thickness
         ):  # where free paths depend on absorption, layers do not know
@@ -452,13 +459,20 @@ def measure(
 
     threads = threads or os.cpu_count() or 1
     done, following = 0, min(paths, FEWEST) if paths else FEWEST
+    wanted, on = paths or max(following, int((SPREAD / target) ** 2)), True
     with ThreadPoolExecutor(threads) as pool:
-        while following:
-            for number, one in enumerate(flat):
-                for share in one.more(following, seed, pool):
-                    within = (number + share) / len(flat)
-                    told((done + within * following) / max(paths or done + following, 1), f"{done + following} paths")
-            done += following
+        while following and on:
+            steps = (
+                (number + share) / len(flat) for number, one in enumerate(flat)
+                for share in one.more(following, seed, pool)
+            )  # fmt: skip
+            for within in steps:
+                told(min((done + within * following) / wanted, 1.0), f"{done + following} of about {wanted} paths")
+                if done and not goes_on(done):
+                    break
+            steps.close()  # jobs that are not begun are not done
+            done = min(int(one.count.sum()) for one in flat)
+            on = goes_on(done)
             spread = [result(group)[0] for group in range(GROUPS)]
             error = _jackknife(spread)
             if paths:
@@ -467,12 +481,13 @@ def measure(
                 needed = min(done * (float(error.max()) / target) ** 2 * 1.05, MOST)
                 following = max(0, min(int(needed) - done, 8 * done)) if error.max() > target else 0
                 following = -(-following // GROUPS) * GROUPS
+                wanted = max(int(needed), done)
     whole, profile = result()
     profile_error = _jackknife([result(group)[1] for group in range(GROUPS)]) if request.depths else profile
-    theory, between, simple = _theories(family, found, request, which)
+    error += found.surface.unsure * np.abs(theories.surface)
     return Albedo(
-        whole[0], whole[1], error[0], error[1], between, theory, simple, profile, profile_error, flat[0].edges, done,
-        eta, sum(one.seconds for one in flat),
+        whole[0], whole[1], error[0], error[1], theories, profile, profile_error, flat[0].edges, done, eta,
+        sum(one.seconds for one in flat),
     )  # fmt: skip
 
 
@@ -482,34 +497,66 @@ def _jackknife(spread: list[np.ndarray]) -> np.ndarray:
     return np.asarray(np.sqrt((GROUPS - 1) / GROUPS * ((values - values.mean(axis=0)) ** 2).sum(axis=0)))
 
 
-def _theories(
-    family: Family, found: Spectrum, request: Request, which: list[int]
-) -> tuple[streams.Streams, np.ndarray, streams.Streams]:
-    """Return two streams, how far off they would be between the tables that paths are followed at, and asymptotics."""
+class Theories(NamedTuple):
+    """What theories say of a slab: from the same optical depth, albedo and g; `doubled` from the whole phase function.
+
+    `between` is how far off two streams would be between the tables that paths are followed at; `surface` what k makes
+    of the surface, which paths do not know, by doubling; `optical_depth` that of the slab, (w,) float64.
+    """
+
+    two_streams: streams.Streams
+    asymptotic: streams.Streams
+    doubled: streams.Streams
+    between: np.ndarray
+    surface: streams.Streams
+    optical_depth: np.ndarray
+
+
+def _theories(family: Family, found: Spectrum, request: Request, which: list[int]) -> Theories:
     n, x, f = found.constants.n, found.absorption_times_radius, request.packing_fraction
-    albedo, g = (np.array([absorbed(table, x)[k] for table in family.tables]) for k in (0, 1))
-    sigma = np.array([extinction(table, f, a) for table, a in zip(family.tables, albedo, strict=True)])
     full, few = family.weights(n), lagrange(family.eta[which], n)
 
     def over(solve: Callable[[float | None], streams.Streams]) -> streams.Streams:
         light = solve(request.cosine)
         return streams.over_ground(light, solve(None), request.ground) if request.ground else light
 
+    def depth(albedo: np.ndarray) -> np.ndarray:
+        each = np.array([extinction(table, f, albedo) for table in family.tables])
+        return np.asarray(request.thickness * np.einsum("wt,tw->w", full, each))
+
     def eddington(depth: np.ndarray, w: np.ndarray, cosine: np.ndarray) -> streams.Streams:
         return over(lambda mu: streams.two_streams(depth, w, cosine, mu))
 
-    mixed = [np.einsum("wt,tw->w", full, values) for values in (sigma, albedo, g)]
-    theory = eddington(request.thickness * mixed[0], np.clip(mixed[1], 0.0, 1.0), mixed[2])
-    each = np.array([eddington(request.thickness * sigma[t], albedo[t], g[t]).reflectance for t in which])
-    between = np.abs(np.einsum("wt,tw->w", few, each) - theory.reflectance)
+    def doubled(found: Spectrum, albedo: np.ndarray) -> streams.Streams:
+        moments, _ = moments_of(family, found, streams.ORDERS)
+        return over(lambda mu: streams.doubled(depth(albedo), albedo, moments, mu))
+
+    single = [absorbed(table, x)[:2] for table in family.tables]
+    each = np.array([
+        eddington(request.thickness * extinction(family.tables[t], f, single[t][0]), *single[t]).reflectance
+        for t in which
+    ])  # fmt: skip
+    albedo, g = np.einsum("wt,tqw->qw", full, np.array(single))
+    albedo = np.clip(albedo, 0.0, 1.0)
+    between = np.abs(np.einsum("wt,tw->w", few, each) - eddington(depth(albedo), albedo, g).reflectance)
+
+    exact = doubled(found, found.albedo)
+    surface = streams.Streams(np.zeros(len(n)), np.zeros(len(n)))
+    if found.surface.changed.any():
+        without = doubled(replace(found, surface=found.surface.of_n), found.surface.albedo_of_n)
+        surface = streams.Streams(*(np.where(found.surface.changed, a - b, 0.0) for a, b in
+                                    zip(exact, without, strict=True)))  # fmt: skip
 
     statistics = [table.statistics for table in family.tables]
-    lossless, length = (np.array([s[name] for s in statistics]) for name in ("mean_cosine", "mean_path_length"))
-    empty = np.array([extinction(table, f, np.ones(1))[0] for table in family.tables])
-    simple = over(
-        lambda mu: streams.asymptotic(request.thickness * (full @ empty), x * (full @ length), full @ lossless, mu)
-    )
-    return theory, between, simple
+    lossless, length = (full @ np.array([s[name] for s in statistics]) for name in ("mean_cosine", "mean_path_length"))
+    empty = depth(np.ones(len(n)))
+    simple = over(lambda mu: streams.asymptotic(empty, x * length, lossless, mu))
+    thick = (1.0 - lossless) * empty >= 1.0  # of a slab thinner than a transport length it knows nothing
+    return Theories(
+        eddington(depth(found.albedo), found.albedo, found.g),
+        streams.Streams(*(np.where(thick, values, math.nan) for values in simple)), exact, between, surface,
+        depth(found.albedo),
+    )  # fmt: skip
 
 
 def records_of(level: str) -> str | None:
@@ -521,12 +568,13 @@ def records_of(level: str) -> str | None:
 def columns(result: Albedo, found: Spectrum) -> dict[str, np.ndarray]:
     """Return what a slab does as named columns; layers of the profile by number, from above."""
     sheet = {
-        "wavelength_nm": found.constants.wavelength_nm,
-        "reflectance": result.reflectance, "reflectance_error": result.reflectance_error, "between": result.between,
+        "wavelength_nm": found.constants.wavelength_nm, "optical_depth": result.theories.optical_depth,
+        "reflectance": result.reflectance, "reflectance_error": result.reflectance_error,
+        "between": result.theories.between,
         "transmittance": result.transmittance, "transmittance_error": result.transmittance_error,
-        "two_streams_r": result.two_streams.reflectance, "two_streams_t": result.two_streams.transmittance,
-        "asymptotic_r": result.asymptotic.reflectance, "asymptotic_t": result.asymptotic.transmittance,
     }  # fmt: skip
+    for name in ("doubled", "two_streams", "asymptotic"):
+        sheet[f"{name}_r"], sheet[f"{name}_t"] = getattr(result.theories, name)
     for number, (layer, error) in enumerate(zip(result.profile, result.profile_error, strict=True), 1):
         sheet[f"absorbed_{number}"], sheet[f"absorbed_{number}_error"] = layer, error
     return sheet

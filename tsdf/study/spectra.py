@@ -2,7 +2,9 @@
 
 Absorption needs no table of its own: each holds the path lengths of its lossless grain. What is left is n, which
 changes slowly over a spectrum, so polynomials through a few tables (at Chebyshev's points, each set holding the one
-before) give the rest; what the last doubling of the points changed bounds what they miss. Slabs are `slabs`.
+before) give the rest; what the last doubling of the points changed bounds what they miss. What k makes of the surface
+is added: light that it sends back outside, which is exact where grains are convex and let nothing through. Slabs are
+`slabs`.
 """
 
 import math
@@ -18,6 +20,7 @@ from tsdf.grain.grains import Grain
 from tsdf.grain.materials import OpticalConstants
 from tsdf.grain.optics import Optics
 from tsdf.make.scatterometer import Build, Effort, exact_sphere
+from tsdf.study.reflection import Surface
 
 TOLERANCE = 5e-4  # of g and of B/n^2, up to which the last doubling of the points may change them
 MOST_STEPS = 16  # between the points, one fewer than points
@@ -25,7 +28,6 @@ SAME = 1e-6  # indices nearer to each other are one
 NM = 1e-9  # [m]
 MOST_WAVELENGTHS = 20_000
 NOTABLE = 1e-3  # of the albedo, from which on what k does to reflectance is told
-NODES = 32  # of the integral over angles of incidence
 
 
 def wavelengths(text: str) -> np.ndarray:
@@ -46,6 +48,8 @@ def wavelengths(text: str) -> np.ndarray:
         raise wrong("not numbers") from None
     found: list[float] = []
     for span in numbers:
+        if len(span) == 3 and (span[0] > span[1] or span[2] <= 0.0):
+            raise wrong("FROM:TO:STEP rises, FROM to TO by a STEP above 0")
         if not all(0.0 < number < 1e9 for number in span):
             raise wrong("each is above 0 and finite")
         if len(span) == 1:
@@ -119,7 +123,7 @@ class Family:
     Raises
     ------
     UsageError
-        If they are of several grains, or two of them have the same index.
+        If they are of several grains or conventions of Fresnel, or two of them have the same index.
     """
 
     tables: tuple[Table, ...]
@@ -131,6 +135,8 @@ class Family:
 
         if any(shape(table) != shape(self.tables[0]) for table in self.tables):
             raise UsageError("the tables are of different grains: give tables of one grain at several indices")
+        if len({str(table.header["optics"]["fresnel"]) for table in self.tables}) > 1:
+            raise UsageError("the tables are made with --fresnel sp and --fresnel un: give tables of one of them")
         if (np.diff(self.eta) <= SAME).any():
             raise UsageError("two of the tables have the same index: give each once")
 
@@ -172,8 +178,8 @@ class Family:
         weights[:, kept] = lagrange(self.eta[kept], n)
         return weights
 
-    def masses(self, n: np.ndarray, absorption_times_radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return edges of cos theta and the deflections of what absorbing grains let out, (len(n), columns) float64.
+    def masses(self, found: "Spectrum") -> tuple[np.ndarray, np.ndarray]:
+        """Return edges of cos theta and the deflections of what absorbing grains let out, (w, columns) float64, sum 1.
 
         Between tables they are mixed linearly: rainbows and halos move with n, and polynomials through cells that they
         pass would be negative beside them. Moments of the mixture are not quite `moments_of`.
@@ -186,12 +192,16 @@ class Family:
         edges = self.tables[0].cos_theta_edges
         if any(not np.array_equal(table.cos_theta_edges, edges) for table in self.tables):
             raise UsageError("the tables have different cells of theta: build them with the same --cells")
-        whole, last = np.zeros((len(n), len(edges) - 1)), len(self.tables) - 1
-        place = np.interp(n, self.eta, np.arange(last + 1.0))
+        x = np.nan_to_num(found.absorption_times_radius)
+        whole, last = np.zeros((len(x), len(edges) - 1)), len(self.tables) - 1
+        place = np.interp(found.constants.n, self.eta, np.arange(last + 1.0))
         for i, table in enumerate(self.tables):
             share = np.maximum(0.0, 1.0 - np.abs(place - i))
             for w in np.flatnonzero(share):
-                whole[w] += share[w] * table.deflection_masses(float(absorption_times_radius[w]))
+                whole[w] += share[w] * table.deflection_masses(float(x[w]))
+        if found.surface.changed.any():
+            whole = np.maximum(found.surface.mean(whole, *found.surface.masses(edges)), 0.0)
+            whole /= whole.sum(axis=1, keepdims=True)
         return edges, whole
 
 
@@ -213,6 +223,8 @@ class Spectrum:
         The two parts of the errors of albedo, g and enhancement.
     notes : tuple of str
         What the reader should know, one line each.
+    surface : Surface
+        What k makes of the grain's surface, which `albedo` and `g` have; `moments_of` and `Family.masses`, too.
     """
 
     constants: Constants
@@ -226,6 +238,7 @@ class Spectrum:
     noise: dict[str, np.ndarray]
     between: dict[str, np.ndarray]
     notes: tuple[str, ...]
+    surface: Surface
 
     def error(self, name: str) -> np.ndarray:
         """Return the error of albedo, g, enhancement or those of the far field."""
@@ -235,6 +248,11 @@ class Spectrum:
             w, g = self.albedo, np.where(self.albedo > 0.0, self.g, 0.0)
             return np.hypot(w * self.error("g"), (g - self.g_far) * self.error("albedo")) / (1.0 + w)
         return self.noise[name] + self.between[name]
+
+
+def convexity(table: Table) -> float:
+    """Return four times the mean projected area of a grain over its surface, 1 of convex ones [1]."""
+    return min(4.0 * table.projected_area.value / float(table.header["grain"]["area"]), 1.0)
 
 
 def absorbed(table: Table, x: np.ndarray) -> np.ndarray:
@@ -276,17 +294,6 @@ def absorbed(table: Table, x: np.ndarray) -> np.ndarray:
     return found
 
 
-def diffuse_reflectance(n: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """Return the mean reflectance of a smooth surface of index n - i k under diffuse light, (w,) float64 [1]."""
-    at, weight = np.polynomial.legendre.leggauss(NODES)
-    mu = 0.5 * (at + 1.0)[:, None]
-    m = n - 1j * k
-    cosine = np.sqrt(1.0 - (1.0 - mu**2) / m**2)
-    s, p = (mu - m * cosine) / (mu + m * cosine), (m * mu - cosine) / (m * mu + cosine)
-    reflectance = 0.5 * (np.abs(s) ** 2 + np.abs(p) ** 2)
-    return np.asarray((weight[:, None] * mu * reflectance).sum(axis=0), np.float64)
-
-
 def spectrum(family: Family, constants: Constants, radius: float) -> Spectrum:
     """Return what grains of a bounding radius [m] do to light by wavelength.
 
@@ -322,21 +329,23 @@ def spectrum(family: Family, constants: Constants, radius: float) -> Spectrum:
             f"{n.min():.5g} to {n.max():.5g}: what that costs is not in the errors (give tables at several indices, "
             "or the grain instead)"
         )
-    known = ~unknown
-    if known.any() and constants.material:  # else k stands for an absorption of which nobody said a wavelength
-        # what k does to reflectance: tables are made with n alone
-        ignored = np.zeros(len(n))
-        ignored[known] = np.abs(
-            diffuse_reflectance(n[known], constants.k[known]) - diffuse_reflectance(n[known], 0.0 * n[known])
-        )
-        missed[0] += ignored
-        if ignored.max() > NOTABLE:
-            there = constants.wavelength_nm[ignored > NOTABLE]
-            notes.append(
-                f"between {there.min():g} and {there.max():g} nm k changes the reflectance of the surface, which is "
-                f"taken from n alone, by up to {ignored.max():.2g}; the errors of the albedo have it"
-            )
     found[0] = np.clip(found[0], 0.0, 1.0)
+    # without a material k stands for an absorption of which nobody said a wavelength
+    k = np.where(unknown, 0.0, constants.k) if constants.material else np.zeros(len(n))
+    surface = Surface(n, k, found[0].copy(), convexity(family.tables[0]))
+    of_surface = np.stack([surface.albedo, surface.mean(found[1], *surface.sent[:, 1])])
+    of_surface[0] = np.where(surface.changed, of_surface[0], found[0])
+    far = np.where(surface.changed, surface.unsure * np.abs(of_surface - np.nan_to_num(found[:2])), 0.0)
+    missed[:2] += far
+    found[:2] = of_surface
+    notable = np.abs(surface.sent[1, 0] - surface.sent[0, 0]) > NOTABLE
+    if notable.any():
+        there, most = constants.wavelength_nm[notable], np.abs(surface.sent[1, 0] - surface.sent[0, 0]).max()
+        where = f"at {there[0]:g}" if len(there) == 1 else f"between {there.min():g} and {there.max():g}"
+        notes.append(
+            f"{where} nm k changes what the surface sends back, by up to {most:.2g}: put in as of convex grains; what "
+            f"that may miss, up to {far[0].max():.1g} of the albedo and {far[1].max():.1g} of g, is in the errors"
+        )
     if unknown.any():
         found[0, unknown] = noise[0, unknown] = missed[0, unknown] = math.nan
         notes.append(
@@ -348,6 +357,7 @@ def spectrum(family: Family, constants: Constants, radius: float) -> Spectrum:
     return Spectrum(
         constants, radius, x, found[0], found[1], np.where(unknown, math.nan, albedo_far), g_far, found[2],
         dict(zip(names, noise, strict=True)), dict(zip(names, missed, strict=True)), tuple(notes),
+        surface,
     )  # fmt: skip
 
 
@@ -373,6 +383,12 @@ def moments_of(family: Family, found: Spectrum, orders: int) -> tuple[np.ndarray
         masses = np.array([table.deflection_masses(float(a)) for a in x])
         whole += weights[:, i, None] * legendre(table.cos_theta_edges, masses, orders)
         straight += weights[:, i] * masses[:, -1]
+    if found.surface.changed.any():
+        edges = np.linspace(-1.0, 1.0, 4 * orders + 65)
+        sent = (legendre(edges, masses, orders) for masses in found.surface.masses(edges))
+        whole = found.surface.mean(whole, *sent)
+        whole[found.surface.changed] /= whole[found.surface.changed, :1]
+        straight = found.surface.mean(straight, np.zeros(len(x)), np.zeros(len(x)))
     return whole, np.clip(straight, 0.0, 1.0)
 
 

@@ -54,12 +54,16 @@ def plot_albedo(found: Albedo, nm: np.ndarray, title: str) -> Any:
         _band(axes, nm, found.reflectance, found.reflectance_error, BLUE, "reflectance, paths")
         if passed:
             _band(axes, nm, found.transmittance, found.transmittance_error, RED, "transmittance, paths")
-        for theory, style, label in ((found.two_streams, "--", "two streams"), (found.asymptotic, ":", "asymptotic")):
+        for theory, style, label in (
+            (found.theories.doubled, "-", "doubling"),
+            (found.theories.two_streams, "--", "two streams"),
+            (found.theories.asymptotic, ":", "asymptotic"),
+        ):
             axes.plot(nm, theory.reflectance, color=GREY, ls=style, lw=1.0, label=label)
             if passed:
                 axes.plot(nm, theory.transmittance, color=GREY, ls=style, lw=1.0)
             below.plot(nm, theory.reflectance - found.reflectance, color=GREY, ls=style, lw=1.0)
-        error = np.hypot(found.reflectance_error, found.between)
+        error = np.hypot(found.reflectance_error, found.theories.between)
         below.fill_between(nm, -error, error, color=BLUE, alpha=BAND, lw=0.0)
         below.set_ylabel("theory − paths")
         axes.set_ylabel("share of the light")
