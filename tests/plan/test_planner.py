@@ -714,6 +714,29 @@ def test_what_decides_is_asked(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch
     assert asked(replace(open_one, variance=0.02**2 * 170.0)) is None
 
 
+def test_asking_on_takes_as_many_samples_of_both(ball: tsdf.Table) -> None:
+    """What is asked about and what it is held against have half as many samples again as the one that had more, and as
+    many; in a short time only what has fewer gets some. A pilot that cannot be made is not asked about again."""
+    run = planner._Planning(pile(ball, 160.0), 0.05, None, 0, 2)
+    run.look()
+    run.refer()
+    volume = Candidate("volume")
+    assert run.reference is not None and run.add(volume)
+    run.round(0.1, [volume], 0.8)
+    own, best = run.pilots[volume], run.pilots[run.reference]
+    before, spent = (own.done, best.done), run.spent
+    run.go_on(volume, 100.0)
+    assert min(own.done, best.done) >= 1.5 * max(before) and run.spent > spent
+    while own.done >= best.done:
+        run.round(0.1, [volume], 1.0)
+    before = best.done
+    run.go_on(volume, 1e-6)
+    assert best.done == before
+    run.impossible["teleport"] = SceneError("no")
+    run.go_on(Candidate("teleport"), 1.0)
+    assert Candidate("teleport") in run.refused and Candidate("teleport") not in run.pilots
+
+
 def test_what_may_be_a_little_above_its_target_is_said(far: Plan) -> None:
     """A level that is likelier than not to meet the target and is a sixth above it if it misses as much as it may is
     taken in a second, where what is sure takes three minutes; how much that may be is said, and what is surer. It is
