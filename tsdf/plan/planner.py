@@ -10,12 +10,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from threading import Event
 
-from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
 from tsdf.errors import SceneError, UsageError
 from tsdf.picture.trust import kurtosis_of
 from tsdf.picture.world import World, build, check_sight
-from tsdf.plan import needs, prior
+from tsdf.plan import asking, needs, prior
 from tsdf.plan.choice import Wish, choose
 from tsdf.plan.evidence import BOLD, BOLD_BIAS, GRAINS, MEETINGS, Evidence
 from tsdf.plan.pilot import CLOCKS, FEWEST, HALVES, MORE, PIXELS, Clocks, Pilot
@@ -27,7 +26,7 @@ from tsdf.scene.scene import Scene, called
 from tsdf.scene.specs import SunLight
 from tsdf.spheres.packing import MAX as MOST_PACKED
 from tsdf.study.candidates import Candidate, candidates, taken
-from tsdf.walk.explicit import Packed, mesh_beside
+from tsdf.walk.explicit import Packed
 from tsdf.walk.geometry import Place, place
 
 TARGET = 0.02  # [1] where nothing else is asked for
@@ -48,7 +47,6 @@ CHECK = 0.15  # of what is left for pilots, for looks at what is chosen and was 
 BRIEF, MOST_CHECKS = 0.3, 3  # [s] that such a look takes at least, and how many there are at most
 WIDE, WIDEST = 2.0, 50.0  # [deg] of suns in pilots that are smaller in the picture, which single grains would hardly
 # ever meet, at least and at most
-CHEAPER = 1.2  # times as long as a candidate as the chosen takes, from which on it is asked whether that would do
 ENOUGH_MORE = 1.5  # times as many samples as there are, that tell more
 AGAIN = 1.3  # times as long as these are likely to take, that they may
 FOREVER = 1e9  # [s] that something takes which never comes to an end
@@ -57,7 +55,6 @@ RUNG = 1.4  # times as wide as the next narrower one that pilots may look at
 TAILED = 1.5  # times what noise makes of it, that the error bar of what is missed is where few pixels make most of it
 SOON = 0.5  # of `MEETINGS`, after the first round, that there will be enough of after the second
 ENOUGH = 4.0  # times `MEETINGS` that they are to be met in the time that the reference has
-MAY = 1.5  # standard errors that a floor may well be off by, where it is asked what is worth a look
 NEAR = 3.0  # times as long as the best as a candidate may seem to take to be looked at again
 EVENT_S = (1.0e-6, 5.0e-6)  # [s] of one explicit grain, an exact sphere and one of facets, about
 PATIENCE = 600.0  # [s] that a picture may take where nothing is said
@@ -146,7 +143,7 @@ class _Planning(Evidence):
         self.limit = self.whole = PATIENCE if seconds is None else seconds
         self.said = seconds is not None and math.isfinite(seconds)  # whether that long is meant, and not at most
         self.told: Callable[[float, str], None] = lambda share, word: None
-        self.scene, self.tables = loaded(scene)  # as pilots see it
+        self.scene, self.tables = needs.loaded(scene)  # as pilots see it
         self.looked_at, self.wider = PIXELS, False
         self.named = [
             (str(spec.table), table)
@@ -203,12 +200,8 @@ class _Planning(Evidence):
             2.0 / max(self.footprint, 1e-6), regional, (self.narrowest, self.wide), self.rarer, self.places,
             self.packings,
         )  # fmt: skip
-        advice = wider_sun(made)
-        return replace(
-            made,
-            why=why(made, self.bodies, self.footprint, self.coverage, str(self.reference)),
-            notes=made.notes + ((advice,) if advice else ()),
-        )
+        lines = why(made, self.bodies, self.footprint, self.coverage, str(self.reference))
+        return replace(made, why=lines, notes=(*made.notes, *filter(None, [wider_sun(made)])))
 
     def settled(self) -> tuple[Prediction, list[Prediction], bool]:
         """Return what is chosen, which a pilot has seen where one can, all predictions, and whether the choice is by
@@ -232,7 +225,7 @@ class _Planning(Evidence):
     def see_to_it(self) -> None:
         """Pilot what is chosen, as far as it was not."""
         for looks in range(MOST_CHECKS):
-            self.see_load()
+            self.load = self.seen_load
             one = self.choose(self.predictions()).candidate
             if one in self.pilots or (looks and self.spent > self.ends + BRIEF) or self.stopped():
                 break
@@ -251,32 +244,23 @@ class _Planning(Evidence):
         found = self.predictions()
         chosen = self.choose(found)
         takes = min(chosen.done(self.target), self.limit / self.load, FOREVER)
-        saved = {p.candidate: self.saved(p, takes, p.candidate == chosen.candidate) for p in found}
-        one = max(saved, key=lambda c: saved[c])
+        saved = {
+            p.candidate: asking.saved(p, self.target, takes, p.candidate == chosen.candidate)
+            for p in found
+            if not (self.dear and p.candidate.single)
+            and not {p.candidate, self.teller(p.candidate)} & {*self.answered, self.reference}
+        }
+        one = max(saved, key=lambda c: saved[c], default=chosen.candidate)
         left = self.ends - self.spent
-        if saved[one] > BRIEF and takes < FOREVER and not self.said:
+        if saved.get(one, 0.0) > BRIEF and takes < FOREVER and not self.said:
             left = max(left, min(SHARE * takes, MOST_SECONDS) - self.spent)
-        return (self.teller(one), left) if saved[one] > 0.0 and left >= BRIEF else None
+        return (self.teller(one), left) if saved.get(one, 0.0) > 0.0 and left >= BRIEF else None
 
     def teller(self, one: Candidate) -> Candidate:
         """Return whose pilot tells most of what a candidate misses: of chains after as many explicit grains, which all
         miss the same, the one that has most samples; or itself."""
         alike = [c for c in self.pilots if c.explicit_grains == one.explicit_grains > 0 and c.leap is None]
         return max(alike, key=lambda c: self.pilots[c].each, default=one)
-
-    def saved(self, p: Prediction, takes: float, chosen: bool) -> float:
-        """Return what it is likely to save of the time that the chosen takes [s], to know whether a candidate meets the
-        target: of another, if it does; of the chosen itself, if it does not, all. Nothing where this is known, or where
-        another would not take a fifth less at best."""
-        if {p.candidate, self.teller(p.candidate)} & {*self.answered, self.reference} or not p.floor.error:
-            return 0.0
-        if p.candidate.single and self.dear:
-            return 0.0
-        misses = 0.5 * math.erfc((self.target - p.floor.value) / (p.floor.error * math.sqrt(2.0)))
-        if chosen:
-            return misses * takes if p.floor.value + MAY * p.floor.error > self.target else 0.0
-        soon = self.hopeful(p)
-        return (1.0 - misses) * (takes - soon) if soon * CHEAPER < takes else 0.0
 
     def go_on(self, one: Candidate, seconds: float) -> None:
         """Take about as many samples again of a candidate and of what it is held against, as many of both, for so long
@@ -555,11 +539,6 @@ class _Planning(Evidence):
         """Whether as much of the time that the picture may take has gone by on the clock as planning may have of it."""
         return self.said and self.clocks.wall() - self.began - self.compiling > MOST_SHARE * self.whole
 
-    def see_load(self) -> None:
-        """See how much longer things take than they would if processors had nothing else to do."""
-        busy = sum(pilot.busy for pilot in self.pilots.values()) / self.threads
-        self.load = max(1.0, sum(pilot.wall for pilot in self.pilots.values()) / max(busy, 1e-9))
-
     def weigh(self) -> None:
         """Say what is not known, and how busy processors are."""
         if self.load > BUSY:
@@ -595,7 +574,8 @@ class _Planning(Evidence):
         """Return the candidates that may be the best, of which pilots are worth their time."""
         found = self.predictions()
         best = min(p.safe_seconds(self.target) for p in found)
-        may = sorted((p for p in found if self.hopeful(p) <= NEAR * best), key=self.hopeful)
+        soon = {p.candidate: asking.hopeful(p, self.target) for p in found}
+        may = sorted((p for p in found if soon[p.candidate] <= NEAR * best), key=lambda p: soon[p.candidate])
         first: list[Candidate] = []
         for p in may:
             if len(first) == MOST_FINALISTS or self.stopped():
@@ -607,10 +587,6 @@ class _Planning(Evidence):
                 first.append(p.candidate)
         return first
 
-    def hopeful(self, p: Prediction) -> float:
-        """Return the time to the target [s] if the floor is as low as it may well be."""
-        return p.seconds(self.target, max(p.floor.value - MAY * p.floor.error, 0.0))
-
     @property
     def wish(self) -> Wish:
         """What the picture is to be like."""
@@ -619,20 +595,3 @@ class _Planning(Evidence):
     def choose(self, found: list[Prediction]) -> Prediction:
         """Return what is taken of these."""
         return choose(found, self.wish)[0]
-
-
-def loaded(scene: Scene) -> tuple[Scene, list[Table]]:
-    """Return a scene that holds its tables, so that they are read once, and these."""
-    media, tables = [], []
-    for medium in scene.media:
-        grains = []
-        for grain in medium.grains:
-            if isinstance(grain.table, Table):
-                table, mesh = grain.table, grain.mesh
-            else:
-                table = tsdf_format.read(grain.table)
-                mesh = grain.mesh or mesh_beside(table, [grain.table.parent])
-            tables.append(table)
-            grains.append(replace(grain, table=table, mesh=mesh))
-        media.append(replace(medium, grains=tuple(grains)))
-    return replace(scene, media=tuple(media)), tables
