@@ -749,7 +749,7 @@ def test_what_may_be_a_little_above_its_target_is_said(far: Plan) -> None:
         quick = replace(sure, variance=0.02**2 * 6.0)  # what is sure takes seconds as well
         assert choose([quick, near], Wish(target, 600.0))[0] == quick
         assert ("; up to 2.4 % as far as is known" in report._first(made)) == (taken_ is near)
-        assert ("explicit is surer, 3 min" in report._other(made)) == (taken_ is near)
+        assert ("explicit, 3 min, which is surer" in report._other(made)) == (taken_ is near)
     for floor, safe in ((Belief(0.0138, 0.0042), False), (Belief(0.01, 0.012), True)):
         one = replace(near, floor=floor)
         made = replace(far, predictions=(one, sure), target=0.02, seconds=None)

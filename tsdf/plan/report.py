@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from tsdf.plan.choice import swamped
-from tsdf.plan.prediction import BLOCK, TIE, UNFINISHED, Plan, Prediction
+from tsdf.plan.choice import Wish, choose, swamped
+from tsdf.plan.prediction import BLOCK, UNFINISHED, Plan, Prediction
 from tsdf.plan.prior import Body
 
 TARGETS = np.geomspace(0.002, 0.5, 120)  # [1] that are tried for what would change a plan's mind
@@ -210,20 +210,18 @@ def _other(plan: Plan) -> str:
         return "no other candidate is possible"
     if plan.able is not None and plan.spp is None and not plan.chosen.seconds(plan.target) <= plan.able:
         return _short_of_time(plan, plan.able)
-    second, chosen = plan.predictions[1], plan.chosen
-    takes = second.safe_seconds(plan.target)
+    chosen = plan.chosen
+    second = min(plan.predictions[1:], key=lambda p: (p.sure_seconds(plan.target), p.floor.value))
+    takes = second.sure_seconds(plan.target)
     runner = f"runner-up: {second.candidate}, {by_clock(plan, takes)}" if math.isfinite(takes) else (
         f"runner-up: {second.candidate}, error {percent(second.floor.value)} at best"
     )  # fmt: skip
-    surest = min(plan.predictions, key=lambda p: p.sure_seconds(plan.target))
-    takes = surest.sure_seconds(plan.target)
-    if _at_most(plan) is not None and surest is not chosen and math.isfinite(takes):
-        runner += f"; {surest.candidate} is surer, {by_clock(plan, takes)}"
+    if math.isfinite(takes) and takes < chosen.sure_seconds(plan.target) and _at_most(plan) is not None:
+        runner += ", which is surer"
     flips = {}
     for target in TARGETS:
-        best = min(plan.predictions, key=lambda p: p.safe_seconds(float(target)))
-        takes = best.safe_seconds(float(target))
-        if math.isfinite(takes) and chosen.safe_seconds(float(target)) > TIE * takes:
+        best = choose(list(plan.predictions), Wish(float(target), math.inf))[0]
+        if best is not chosen and math.isfinite(best.done(float(target))):
             flips[float(target)] = best
     lower = [t for t in flips if OTHER * t < plan.target]
     upper = [t for t in flips if t > OTHER * plan.target]
