@@ -124,6 +124,7 @@ class Truth:
     def take(self, seconds: float, others: Sequence[Candidate] = ()) -> None:
         """Take pictures until so much processor time is spent [s], or all is known; of others as well."""
         wanted = [one for one in candidates(grains=GRAINS) if one in others or one in self.shots or usual(one)]
+        wanted += sorted({one for one in others if one.leap is not None} - set(wanted))
         before = self.spent
         for one in (EXPLICIT, *wanted):
             if one not in self.shots:
@@ -185,7 +186,7 @@ class Truth:
             )
         seed = SEED + n  # of level explicit, and what is held beside it
         if not (one == EXPLICIT or one.explicit_grains):
-            seed += 1000 * (1 + candidates(grains=GRAINS).index(one))
+            seed += 1000 * (1 + candidates(grains=GRAINS).index(one._replace(leap=None))) + 500 * (one.leap is not None)
         picture = render.render(self.worlds[one], shots.spp, seed=seed, threads=1)
         shots.batches.append(picture.rgb.astype(np.float32))
         shots.variance = shots.variance + picture.variance

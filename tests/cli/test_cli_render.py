@@ -337,8 +337,8 @@ def test_a_reader_who_is_gone_costs_no_result(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.slow
 def test_level_auto(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A scene without a level is planned: what is taken, why, and what fixes it is said once, and is in the file; the
-    command that is named makes the same picture. With a level nothing is planned."""
+    """A scene without a level is planned: what is taken, why, and what names it is said once, and is in the file; the
+    options that are named make the same picture. With a level nothing is planned."""
     from tsdf.plan import planner
 
     monkeypatch.setattr(planner, "SECONDS", 1.0)
@@ -347,15 +347,18 @@ def test_level_auto(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     words = [str(folder / "auto.toml"), "--out", str(folder / "a.exr")]
     result = CliRunner().invoke(main, words, prog_name="tsdf-render")
     assert result.exit_code == 0, result.stderr
-    (line,) = (line for line in result.stderr.splitlines() if line.startswith("note: level auto: take "))
-    fixed = re.search(r"; (--level \S+( --explicit-grains \S+)?) fixes it$", line)
-    assert fixed is not None
+    lines = result.stderr.splitlines()
+    (at,) = (n for n, line in enumerate(lines) if line.startswith("note: level auto: take "))
+    again = re.fullmatch(
+        r"note: to have the same again without planning: (--level \S+( --explicit-grains \S+)?)", lines[at + 1]
+    )
+    assert again is not None
     said = facts(folder / "a.exr")
     assert said["chosen"]["level"] == said["level"] and said["samples"] == [3, 3] and said["chosen"]["target"] == 0.02
     monkeypatch.setattr(planner, "plan", lambda *_: pytest.fail("a plan is made"))
     monkeypatch.setattr("tsdf.plan.shot.plan", lambda *_: pytest.fail("a plan is made"))
-    again = CliRunner().invoke(main, [*words[:2], str(folder / "b.exr"), *fixed[1].split(), "--quiet"])
-    assert again.exit_code == 0 and "level auto" not in again.stderr
+    same = CliRunner().invoke(main, [*words[:2], str(folder / "b.exr"), *again[1].split(), "--quiet"])
+    assert same.exit_code == 0 and "level auto" not in same.stderr
     np.testing.assert_array_equal(image.read_exr(folder / "b.exr").rgb, image.read_exr(folder / "a.exr").rgb)
     assert "chosen" not in facts(folder / "b.exr")
 

@@ -17,6 +17,7 @@ from tsdf.errors import SceneError, UsageError
 from tsdf.picture import render, world
 from tsdf.plan import evidence, planner, report, shot
 from tsdf.plan.beliefs import CERTAIN, Belief
+from tsdf.plan.choice import Wish, choose
 from tsdf.plan.pilot import Apart, Clocks, Pilot
 from tsdf.plan.planner import plan
 from tsdf.plan.prediction import TIE, Plan, Prediction
@@ -426,7 +427,7 @@ def test_bias_falls_with_the_grains_that_are_left_to_a_level(ball: tsdf.Table, m
 @pytest.mark.slow
 def test_bolder_leaps_are_looked_at_where_they_may_win(far: Plan, ball: tsdf.Table) -> None:
     """At the level whose events are dear, where there are leaps, nobody has named any, and the error would still do;
-    what is taken is rendered so, and the options that fix it say so."""
+    what is taken is rendered so, and the options that name it say so."""
     run = planner._Planning(pile(ball, 160.0), 0.05, None, 0, 2)
     chosen = replace(of(far, "teleport-memory"), floor=Belief(0.02, 0.005))
     run.pilots[chosen.candidate] = SimpleNamespace(world=SimpleNamespace(leap=2.0))
@@ -657,6 +658,116 @@ def test_errors_of_hundreds_of_per_cent_are_explained(far: Plan) -> None:
     assert "16 by 16" not in report._first(far)
     noisy = replace(made, predictions=(replace(p, variance=16.0), *far.predictions[1:]), glints=300.0)
     assert "mostly noise until 5 min" in report._first(noisy)
+
+
+def candidate(level: str, variance: float, floor: float = 0.0, error: float = 0.0, turn: float = 1.0) -> Prediction:
+    return Prediction(
+        Candidate(level), 0.0, 0.0, floor, error, Belief(floor, error), variance, turn, piloted=True, known=True
+    )
+
+
+def test_how_wide_a_sun_has_to_be(far: Plan) -> None:
+    """Where single grains are left out under a small sun, a note says how wide it has to be for them to have the target
+    in the time: the variance falls as the sun grows, from that under the real one to what pilots have seen of it; or,
+    where that is not enough, what they have under the widest that these looked at. Nothing is said where even that is
+    mostly noise, or where nothing is missed."""
+    miss = candidate("volume-hg", 1.0, 1.1, 0.1)
+    for variance, words in (
+        (25.6, "angular_diameter_deg = 4, as bright, explicit would show them, with an error of about 20 % after 10 s"),
+        (1638.4, "angular_diameter_deg = 16, as bright, explicit would show them, with an error of about 40 % after"),
+        (6553.6, None),
+    ):
+        found = (miss, candidate("explicit", variance))
+        made = replace(far, predictions=found, target=0.2, seconds=10.0, suns=(0.5, 16.0), rarer=1024.0)
+        told = report.wider_sun(made)
+        assert (told is None) == (words is None) and (words or "") in (told or ""), told
+    made = replace(made, predictions=(miss, candidate("explicit", 25.6)))
+    assert report.wider_sun(made) and report.wider_sun(replace(made, rarer=1.0)) is None
+    assert report.wider_sun(replace(made, predictions=(replace(miss, floor=Belief(0.1, 0.1)), *found[1:]))) is None
+
+
+def test_what_decides_is_asked(ball: tsdf.Table, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A level that is within its error bar of the target and takes a second where what is sure takes three minutes is
+    piloted on, for a tenth of these; not where it is told, or saves less than a fifth, nor beyond the share of a time
+    that was named, nor once planning is interrupted, nor where more samples tell no more."""
+
+    def asked(level: Prediction, seconds: float | None = None) -> tuple[Candidate, float] | None:
+        run = planner._Planning(pile(ball, 160.0), 0.02, seconds, 0, 1)
+        run.spent, run.known = run.ends, 1.0
+        found = [candidate("explicit", 0.02**2 * 180.0), level]
+        monkeypatch.setattr(planner._Planning, "predictions", lambda _: found)
+        first = run.question()
+        run.answered = {level.candidate}
+        assert run.question() is None
+        run.answered = set()
+        run.stop.set()
+        assert run.question() is None
+        return first
+
+    open_one = candidate("volume", 0.02**2, 0.039, 0.016)
+    which = asked(open_one)
+    assert which is not None and which[0] == open_one.candidate
+    assert which[1] == pytest.approx(0.1 * 180.0 - planner.planning_seconds(None))
+    assert asked(open_one, 300.0) is None
+    for told in (Belief(0.039, 0.002), Belief(0.01, 0.002)):
+        assert asked(replace(open_one, floor=told)) is None
+    assert asked(replace(open_one, variance=0.02**2 * 170.0)) is None
+
+
+def test_asking_on_takes_as_many_samples_of_both(ball: tsdf.Table) -> None:
+    """What is asked about and what it is held against have half as many samples again as the one that had more, and as
+    many; in a short time only what has fewer gets some. A pilot that cannot be made is not asked about again."""
+    run = planner._Planning(pile(ball, 160.0), 0.05, None, 0, 2)
+    run.look()
+    run.refer()
+    volume = Candidate("volume")
+    assert run.reference is not None and run.add(volume)
+    run.round(0.1, [volume], 0.8)
+    own, best = run.pilots[volume], run.pilots[run.reference]
+    before, spent = (own.done, best.done), run.spent
+    run.go_on(volume, 100.0)
+    assert min(own.done, best.done) >= 1.5 * max(before) and run.spent > spent
+    while own.done >= best.done:
+        run.round(0.1, [volume], 1.0)
+    before = best.done
+    run.go_on(volume, 1e-6)
+    assert best.done == before
+    run.impossible["teleport"] = SceneError("no")
+    run.go_on(Candidate("teleport"), 1.0)
+    assert Candidate("teleport") in run.refused and Candidate("teleport") not in run.pilots
+
+
+def test_what_may_be_a_little_above_its_target_is_said(far: Plan) -> None:
+    """A level that is likelier than not to meet the target and is a sixth above it if it misses as much as it may is
+    taken in a second, where what is sure takes three minutes; how much that may be is said, and what is surer. It is
+    rendered until the whole of it is the target, or for longer where it would be above it by more than a fifth then."""
+    sure, near = candidate("explicit", 0.02**2 * 180.0), candidate("volume", 0.0144**2, 0.0138, 0.0066)
+    for target, taken_ in ((0.02, near), (0.0138, sure)):
+        found = (taken_, near if taken_ is sure else sure)
+        made = replace(far, predictions=found, target=target, seconds=None)
+        assert choose([sure, near], Wish(target, 600.0))[0] == taken_
+        quick = replace(sure, variance=0.02**2 * 6.0)  # what is sure takes seconds as well
+        assert choose([quick, near], Wish(target, 600.0))[0] == quick
+        assert ("; up to 2.4 % as far as is known" in report._first(made)) == (taken_ is near)
+        assert ("explicit, 3 min, which is surer" in report._other(made)) == (taken_ is near)
+    for floor, safe in ((Belief(0.0138, 0.0042), False), (Belief(0.01, 0.012), True)):
+        one = replace(near, floor=floor)
+        made = replace(far, predictions=(one, sure), target=0.02, seconds=None)
+        assert (math.hypot(made.noise, floor.value) < 0.0199) == safe
+        assert math.hypot(made.noise, floor.high) <= 1.2 * 0.02 + 1e-9
+        assert one.done(0.02) == pytest.approx((0.0144 / made.noise) ** 2)
+    assert not replace(near, floor=Belief(0.0138, 0.011)).reaches(0.02)
+
+
+def test_all_times_are_of_one_kind(far: Plan) -> None:
+    """What three lines and the table say takes as long by the clock, on processors three times as busy as free ones."""
+    found = tuple(candidate(level, 0.04) for level in ("explicit", "teleport-memory"))
+    for load, said in ((1.0, "16 s"), (3.0, "48 s")):
+        made = replace(far, predictions=found, target=0.05, seconds=None, load=load)
+        assert f"after about {said}" in report._first(made) and f"teleport-memory, {said}" in report._other(made)
+        assert f"  {said}  " in report.table(made)[1]
+        hurried = replace(made, seconds=3.0)
+        assert f"would take explicit and {said} instead of 3 s" in report._other(hurried)
 
 
 def test_few_samples_are_not_spent_on_glints(ball: tsdf.Table) -> None:

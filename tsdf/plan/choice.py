@@ -7,6 +7,7 @@ from typing import NamedTuple
 from tsdf.plan.prediction import TIE, UNFINISHED, Prediction
 from tsdf.scene.levels import LEVELS
 
+SPARED = 5.0  # [s] that one has to spare for one to be taken that may be a little above the target; as planning takes
 SWAMPED = 1.2  # times the least error of pixels that one may have and be taken for its regions
 
 
@@ -41,12 +42,13 @@ class Wish(NamedTuple):
 def choose(found: list[Prediction], wish: Wish) -> tuple[Prediction, bool]:
     """Return what is taken, and whether that is by the error of regions.
 
-    It is the cheapest that is sure enough to meet the target; if there is a time and none does, the one with the least
-    error in it, of those that aim at small suns. With so many samples it is the cheapest of those whose noise is about
-    the least, or small enough, and that miss less than the target. None is taken of whose noise nothing is known,
-    unless nothing is of any. Where that with the least error has no single grains and misses more texture than the
-    target, no pixel can be right with it, nor with any other that has none: of these, as far as their errors are within
-    a fifth of it, it is the one whose regions are.
+    It is the cheapest that meets the target if bias and texture are as large as may well be; or one that is likely to,
+    and at most a fifth above it then, if that saves more than planning takes. If there is a time and none does, it is
+    the one with the least error in it, of those that aim at small suns. With so many samples it is the cheapest of
+    those whose noise is about the least, or small enough, and that miss less than the target. None is taken of whose
+    noise nothing is known, unless nothing is of any. Where that with the least error has no single grains and misses
+    more texture than the target, no pixel can be right with it, nor with any other that has none: of these, as far as
+    their errors are within a fifth of it, it is the one whose regions are.
     """
     found = [p for p in found if math.isfinite(p.variance)] or found
     if wish.dear:  # what few samples have told of paths that long is not what they take
@@ -58,8 +60,10 @@ def choose(found: list[Prediction], wish: Wish) -> tuple[Prediction, bool]:
         alike = [p for p in aimed if after[p.candidate] <= enough] or aimed  # of pilots without light
         fit = [p for p in alike if p.floor.high < wish.target]
         return min(fit, key=lambda p: p.turn) if fit else safest(alike, lambda p: p.floor.high), False
-    best = min(found, key=lambda p: p.safe_seconds(wish.target))
-    takes, limit = best.safe_seconds(wish.target), wish.limit
+    limit, time_of = wish.limit, Prediction.sure_seconds
+    takes, soon = (min(by(p, wish.target) for p in found) for by in (time_of, Prediction.safe_seconds))
+    if takes > min(soon + SPARED, limit):
+        takes, time_of = soon, Prediction.safe_seconds
     if not takes <= limit and math.isfinite(limit):
         # sparkle that is not rendered to the end is nothing but noise; and what all miss tells none from the others
         aimed = [p for p in found if not wish.unfinished(p) and p.turn <= limit]
@@ -72,7 +76,7 @@ def choose(found: list[Prediction], wish: Wish) -> tuple[Prediction, bool]:
         return safest(alike, lambda p: math.hypot(p.bias, p.bias_error, p.noise(limit))), False
     if math.isinf(takes):
         return safest(found, lambda p: p.floor.high), False
-    alike = [p for p in found if p.safe_seconds(wish.target) <= TIE * takes]
+    alike = [p for p in found if time_of(p, wish.target) <= TIE * takes]
     return min(alike, key=lambda p: p.floor.high), False
 
 

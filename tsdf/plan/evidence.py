@@ -90,6 +90,12 @@ class Evidence:
             and not (one.explicit_grains and "explicit" in self.impossible)
         ]
 
+    @property
+    def seen_load(self) -> float:
+        """How many times as long pilots took as they would have if processors had nothing else to do."""
+        busy = sum(pilot.busy for pilot in self.pilots.values()) / self.threads
+        return max(1.0, sum(pilot.wall for pilot in self.pilots.values()) / max(busy, 1e-9))
+
     def trusted(self, pilot: Pilot, share: float = 1.0) -> bool:
         """Return whether a pilot has seen light, and met what only chance finds of it often enough to be believed, or a
         share of that."""

@@ -1,12 +1,16 @@
-"""Needs: what tables lack for a picture, and the commands that make it."""
+"""Needs: the tables of a scene, what they lack for a picture, and the commands that make it."""
 
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+from tsdf.data import format as tsdf_format
 from tsdf.data import library
 from tsdf.data.table import Table
 from tsdf.scene.levels import LEVELS
+from tsdf.scene.scene import Scene
+from tsdf.walk.explicit import mesh_beside
 
 ENOUGH = 0.25  # of the error that is asked for that a table may be off by
 
@@ -75,3 +79,20 @@ def _beside(name: str, wants: dict[str, str]) -> str:
     stem += "".join(option.removeprefix("-") for option in wants)
     tried = [f"{stem}.tsdf.exr", *(f"{stem}-{n}.tsdf.exr" for n in range(2, 1000))]
     return str(folder / next((one for one in tried if not (folder / one).exists()), tried[0]))
+
+
+def loaded(scene: Scene) -> tuple[Scene, list[Table]]:
+    """Return a scene that holds its tables, so that they are read once, and these."""
+    media, tables = [], []
+    for medium in scene.media:
+        grains = []
+        for grain in medium.grains:
+            if isinstance(grain.table, Table):
+                table, mesh = grain.table, grain.mesh
+            else:
+                table = tsdf_format.read(grain.table)
+                mesh = grain.mesh or mesh_beside(table, [grain.table.parent])
+            tables.append(table)
+            grains.append(replace(grain, table=table, mesh=mesh))
+        media.append(replace(medium, grains=tuple(grains)))
+    return replace(scene, media=tuple(media)), tables

@@ -121,6 +121,16 @@ class Pilot:
         """Samples of a pixel in each half, of the first of them."""
         return int(self.counts[0])
 
+    @property
+    def done(self) -> int:
+        """Samples of each pixel in each half that every thread has taken, of those that samples are taken of now."""
+        return int(self.counts[self.active]) // self.threads
+
+    def seconds_to(self, done: int) -> float:
+        """Return about how long [s] it takes until these are so many; by another's times while it has none."""
+        each = self.sample_seconds or (self.like.sample_seconds if self.like is not None else 0.0)
+        return max(done - self.done, 0) * HALVES * (len(self.pixels) - self.active) * each
+
     def look_wider(self, pixels: int) -> None:
         """Have samples be taken of about so many pixels from here on, none of which it has looked at."""
         camera = self.world.scene.camera
@@ -154,7 +164,7 @@ class Pilot:
             left = seconds - (self.busy - begun) / self.threads
             if left < took or self.clocks.wall() - began > LATE * seconds:
                 break
-            done = int(self.counts[self.active]) // self.threads
+            done = self.done
             able = max(min(int(0.7 * left / max(took, 1e-9)), most), 1)
             share = (1 << done.bit_length()) - done  # to the next power of two
             if share > able:

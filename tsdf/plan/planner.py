@@ -10,24 +10,23 @@ from collections.abc import Callable
 from dataclasses import replace
 from threading import Event
 
-from tsdf.data import format as tsdf_format
 from tsdf.data.table import Table
 from tsdf.errors import SceneError, UsageError
 from tsdf.picture.trust import kurtosis_of
 from tsdf.picture.world import World, build, check_sight
-from tsdf.plan import needs, prior
+from tsdf.plan import asking, needs, prior
 from tsdf.plan.choice import Wish, choose
 from tsdf.plan.evidence import BOLD, BOLD_BIAS, GRAINS, MEETINGS, Evidence
 from tsdf.plan.pilot import CLOCKS, FEWEST, HALVES, MORE, PIXELS, Clocks, Pilot
 from tsdf.plan.prediction import Plan, Prediction
-from tsdf.plan.report import BUSY, digits, why
+from tsdf.plan.report import BUSY, digits, why, wider_sun
 from tsdf.scene.levels import LEVELS
 from tsdf.scene.medium import Component, free_path
 from tsdf.scene.scene import Scene, called
 from tsdf.scene.specs import SunLight
 from tsdf.spheres.packing import MAX as MOST_PACKED
 from tsdf.study.candidates import Candidate, candidates, taken
-from tsdf.walk.explicit import Packed, mesh_beside
+from tsdf.walk.explicit import Packed
 from tsdf.walk.geometry import Place, place
 
 TARGET = 0.02  # [1] where nothing else is asked for
@@ -48,6 +47,10 @@ CHECK = 0.15  # of what is left for pilots, for looks at what is chosen and was 
 BRIEF, MOST_CHECKS = 0.3, 3  # [s] that such a look takes at least, and how many there are at most
 WIDE, WIDEST = 2.0, 50.0  # [deg] of suns in pilots that are smaller in the picture, which single grains would hardly
 # ever meet, at least and at most
+ENOUGH_MORE = 1.5  # times as many samples as there are, that tell more
+AGAIN = 1.3  # times as long as these are likely to take, that they may
+FOREVER = 1e9  # [s] that something takes which never comes to an end
+LESS = 0.95  # of an error bar that more samples have to leave, or there is no use in them
 RUNG = 1.4  # times as wide as the next narrower one that pilots may look at
 TAILED = 1.5  # times what noise makes of it, that the error bar of what is missed is where few pixels make most of it
 SOON = 0.5  # of `MEETINGS`, after the first round, that there will be enough of after the second
@@ -140,7 +143,7 @@ class _Planning(Evidence):
         self.limit = self.whole = PATIENCE if seconds is None else seconds
         self.said = seconds is not None and math.isfinite(seconds)  # whether that long is meant, and not at most
         self.told: Callable[[float, str], None] = lambda share, word: None
-        self.scene, self.tables = loaded(scene)  # as pilots see it
+        self.scene, self.tables = needs.loaded(scene)  # as pilots see it
         self.looked_at, self.wider = PIXELS, False
         self.named = [
             (str(spec.table), table)
@@ -158,6 +161,7 @@ class _Planning(Evidence):
         self.packings: dict[bool, Packed] = {}
         self.wide = WIDE  # [deg] of suns in pilots, at least
         self.real = 0.0  # `chance` of the suns of the picture
+        self.answered: set[Candidate] = set()  # of which more samples would tell no more
         self.dear = False  # whether single grains cannot be piloted
 
     def plan(self) -> Plan:
@@ -180,8 +184,8 @@ class _Planning(Evidence):
         self.round((1.0 - FIRST - CHECK) * left, list(dict.fromkeys((*self.finalists(), *glints))))
         self.known = 1.0 - CHECK
         self.refer_anew()
-        self.weigh()
         chosen, found, regional = self.settled()
+        self.weigh()
         rest = sorted((p for p in found if p is not chosen), key=lambda p: (p.safe_seconds(self.target), p.floor.value))
         far = bool(chosen.candidate.explicit_grains) and self.far
         thin = all(medium.packing_fraction <= MOST_PACKED for medium in self.scene.media)
@@ -193,23 +197,19 @@ class _Planning(Evidence):
             self.asked, self.target, self.limit if self.said or beyond else None, (chosen, *rest), far, (),
             tuple(lacking), tuple(self.notes), self.spent, self.clocks.wall() - self.began, self.compiling,
             self.threads, self.load, self.spp, self.load * self.wish.glints(chosen, rest) if beyond else 0.0,
-            2.0 / max(self.footprint, 1e-6), regional, self.places, self.packings,
+            2.0 / max(self.footprint, 1e-6), regional, (self.narrowest, self.wide), self.rarer, self.places,
+            self.packings,
         )  # fmt: skip
-        return replace(made, why=why(made, self.bodies, self.footprint, self.coverage, str(self.reference)))
+        lines = why(made, self.bodies, self.footprint, self.coverage, str(self.reference))
+        return replace(made, why=lines, notes=(*made.notes, *filter(None, [wider_sun(made)])))
 
     def settled(self) -> tuple[Prediction, list[Prediction], bool]:
         """Return what is chosen, which a pilot has seen where one can, all predictions, and whether the choice is by
         the error of regions."""
-        for looks in range(MOST_CHECKS):
-            one = self.choose(self.predictions()).candidate
-            if one in self.pilots or (looks and self.spent > self.ends + BRIEF) or self.stopped():
-                break
-            if self.dear and LEVELS[one.level].traits.packed:
-                if self.possible(one) is not None:
-                    break
-            elif self.add(one):
-                self.round(max(0.5 * (self.ends - self.spent), BRIEF), [one])
-            self.refused |= {one} - set(self.pilots)
+        self.see_to_it()
+        while (asked := self.question()) is not None:
+            self.go_on(*asked)
+        self.see_to_it()
         found = self.predictions()
         seen = [
             p for p in found if p.candidate in self.pilots or (self.dear and LEVELS[p.candidate.level].traits.packed)
@@ -221,6 +221,66 @@ class _Planning(Evidence):
             plain, bolder = (next(p for p in found if p.candidate == one) for one in (chosen.candidate, bold))
             chosen = bolder if bolder.safe_seconds(self.target) < plain.safe_seconds(self.target) else plain
         return chosen, found, regional
+
+    def see_to_it(self) -> None:
+        """Pilot what is chosen, as far as it was not."""
+        for looks in range(MOST_CHECKS):
+            self.load = self.seen_load
+            one = self.choose(self.predictions()).candidate
+            if one in self.pilots or (looks and self.spent > self.ends + BRIEF) or self.stopped():
+                break
+            if self.dear and LEVELS[one.level].traits.packed:
+                if self.possible(one) is not None:
+                    break
+            elif self.add(one):
+                self.round(max(0.5 * (self.ends - self.spent), BRIEF), [one])
+            self.refused |= {one} - set(self.pilots)
+
+    def question(self) -> tuple[Candidate, float] | None:
+        """Return what is to be piloted on, for what that may save, and for how long at most [s]; None once all is told,
+        or planning has taken its share of what the chosen takes."""
+        if self.spp is not None or self.stopped():
+            return None
+        found = self.predictions()
+        chosen = self.choose(found)
+        takes = min(chosen.done(self.target), self.limit / self.load, FOREVER)
+        saved = {
+            p.candidate: asking.saved(p, self.target, takes, p.candidate == chosen.candidate)
+            for p in found
+            if not (self.dear and p.candidate.single)
+            and not {p.candidate, self.teller(p.candidate)} & {*self.answered, self.reference}
+        }
+        one = max(saved, key=lambda c: saved[c], default=chosen.candidate)
+        left = self.ends - self.spent
+        if saved.get(one, 0.0) > BRIEF and takes < FOREVER and not self.said:
+            left = max(left, min(SHARE * takes, MOST_SECONDS) - self.spent)
+        return (self.teller(one), left) if saved.get(one, 0.0) > 0.0 and left >= BRIEF else None
+
+    def teller(self, one: Candidate) -> Candidate:
+        """Return whose pilot tells most of what a candidate misses: of chains after as many explicit grains, which all
+        miss the same, the one that has most samples; or itself."""
+        alike = [c for c in self.pilots if c.explicit_grains == one.explicit_grains > 0 and c.leap is None]
+        return max(alike, key=lambda c: self.pilots[c].each, default=one)
+
+    def go_on(self, one: Candidate, seconds: float) -> None:
+        """Take about as many samples again of a candidate and of what it is held against, as many of both, for so long
+        at most [s]. It is answered where that does not tell more."""
+        assert self.reference is not None
+        if one not in self.pilots and not self.add(one):
+            self.refused |= {one}
+            return
+        own, best, seen = self.pilots[one], self.pilots[self.reference], self.apart(one)
+        most = max(own.done, best.done) if own.active == best.active else 0
+        goals = [1 << math.ceil(math.log2(ENOUGH_MORE * max(most, p.done, 1))) for p in (own, best)]
+        wanted = [p.seconds_to(goal) for p, goal in zip((own, best), goals, strict=True)]
+        if AGAIN * sum(wanted) > seconds and own.done < most:  # as many as the other has will have to do
+            wanted = [own.seconds_to(most), 0.0]
+        of_reference = wanted[1] / max(sum(wanted), 1e-9)
+        before = self.spent
+        self.round(min(AGAIN * sum(wanted), seconds), [one], of_reference)
+        now = self.apart(one)
+        if self.spent == before or (seen and now and now.square_error > LESS * seen.square_error):
+            self.answered |= {one}
 
     def bolder_of(self, chosen: Prediction) -> Candidate | None:
         """Return a candidate with bolder leaps, where they may win and its error would still do: at the level whose
@@ -289,6 +349,12 @@ class _Planning(Evidence):
         self.chance = kurtosis_of(build(self.scene, "volume", leap=0.0, places=self.places).lights)
         self.rarer = max(self.real / self.chance, 1.0)
         return True
+
+    @property
+    def narrowest(self) -> float:
+        """How wide the smallest sun of the scene is [deg]."""
+        suns = [light.angular_diameter_deg for light in self.asked.lights if isinstance(light, SunLight)]
+        return min(suns, default=math.inf)
 
     def foreseen(self, level: str) -> prior.Expected:
         """Return what is expected of a level, of the medium of which most is."""
@@ -474,13 +540,11 @@ class _Planning(Evidence):
         return self.said and self.clocks.wall() - self.began - self.compiling > MOST_SHARE * self.whole
 
     def weigh(self) -> None:
-        """See how much longer things take than they would if processors had nothing else to do."""
-        busy = sum(pilot.busy for pilot in self.pilots.values()) / self.threads
-        self.load = max(1.0, sum(pilot.wall for pilot in self.pilots.values()) / max(busy, 1e-9))
+        """Say what is not known, and how busy processors are."""
         if self.load > BUSY:
             self.notes.append(
-                f"processors are busy with other things: now everything takes {self.load:.1f} times as long; in the "
-                'table "idle" is without that, "busy" with it'
+                f"processors are busy with other things: everything takes {self.load:.1f} times as long as without, "
+                "which is in all times that are said here"
             )
         if self.known > 0.0 and self.stop.is_set():
             self.notes.append("planning was interrupted: this is what pilots had seen by then")
@@ -510,7 +574,8 @@ class _Planning(Evidence):
         """Return the candidates that may be the best, of which pilots are worth their time."""
         found = self.predictions()
         best = min(p.safe_seconds(self.target) for p in found)
-        may = sorted((p for p in found if self.hopeful(p) <= NEAR * best), key=self.hopeful)
+        soon = {p.candidate: asking.hopeful(p, self.target) for p in found}
+        may = sorted((p for p in found if soon[p.candidate] <= NEAR * best), key=lambda p: soon[p.candidate])
         first: list[Candidate] = []
         for p in may:
             if len(first) == MOST_FINALISTS or self.stopped():
@@ -522,10 +587,6 @@ class _Planning(Evidence):
                 first.append(p.candidate)
         return first
 
-    def hopeful(self, p: Prediction) -> float:
-        """Return the time to the target [s] if the floor is as low as it may well be."""
-        return p.seconds(self.target, max(p.floor.value - 1.5 * p.floor.error, 0.0))
-
     @property
     def wish(self) -> Wish:
         """What the picture is to be like."""
@@ -534,20 +595,3 @@ class _Planning(Evidence):
     def choose(self, found: list[Prediction]) -> Prediction:
         """Return what is taken of these."""
         return choose(found, self.wish)[0]
-
-
-def loaded(scene: Scene) -> tuple[Scene, list[Table]]:
-    """Return a scene that holds its tables, so that they are read once, and these."""
-    media, tables = [], []
-    for medium in scene.media:
-        grains = []
-        for grain in medium.grains:
-            if isinstance(grain.table, Table):
-                table, mesh = grain.table, grain.mesh
-            else:
-                table = tsdf_format.read(grain.table)
-                mesh = grain.mesh or mesh_beside(table, [grain.table.parent])
-            tables.append(table)
-            grains.append(replace(grain, table=table, mesh=mesh))
-        media.append(replace(medium, grains=tuple(grains)))
-    return replace(scene, media=tuple(media)), tables

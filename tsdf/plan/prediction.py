@@ -11,7 +11,7 @@ from tsdf.walk.explicit import Packed
 from tsdf.walk.geometry import Place
 
 TIE = 1.1  # times as long as the cheapest as it may take, of those the one with the least error is taken
-
+SLACK = 1.2  # times the target, that the error of what is taken may be if bias and texture are as large as may well be
 UNFINISHED = 0.5  # [1] noise of pixels over their mean, above which single grains under small suns are but bright dots
 BLOCK = 16  # pixels across, of whose means the error is said where that of a pixel says little
 HALF = math.log(2.0)  # meetings that are expected, below which it is likelier than not that there is none
@@ -117,8 +117,20 @@ class Prediction:
         return self.variance * self.turn / left if left > 0.0 else math.inf
 
     def safe_seconds(self, target: float) -> float:
+        """Return the time to an error [s] that is at most a fifth larger if the floor is as high as it may well be."""
+        return max(self.seconds(target), self.seconds(SLACK * target, self.floor.high))
+
+    def sure_seconds(self, target: float) -> float:
         """Return the time to an error [s] if the floor is as high as it may well be."""
         return self.seconds(target, self.floor.high)
+
+    def done(self, target: float) -> float:
+        """Return when a picture is done that is to have an error [s]."""
+        return self.safe_seconds(target) if self.reaches(target) else self.seconds(target)
+
+    def reaches(self, target: float) -> bool:
+        """Return whether there is such a time."""
+        return self.floor.value < target and self.floor.high < SLACK * target
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +174,10 @@ class Plan:
         How many pixels a grain looks across, about.
     regional : bool
         Whether the choice is by the error of regions: all that is left misses alike in pixels.
+    suns : tuple of float
+        How wide the smallest sun is, and at least in pilots [deg].
+    rarer : float
+        How many times as seldom as in pilots single grains meet suns in the picture.
     places, packings : dict
         Geometry and packed grains of the scene as far as they were made, for `tsdf.picture.world.build`.
     """
@@ -183,6 +199,8 @@ class Plan:
     glints: float = 0.0
     grain: float = 1.0
     regional: bool = False
+    suns: tuple[float, float] = (math.inf, math.inf)
+    rarer: float = 1.0
     places: dict[bool, Place] = field(default_factory=dict)
     packings: dict[bool, Packed] = field(default_factory=dict)
 
@@ -197,8 +215,11 @@ class Plan:
 
     @property
     def noise(self) -> float:
-        """Standard error of pixels at which the whole error is the target; half of it where that is out of reach."""
-        return math.sqrt(max(self.target**2 - self.chosen.floor.value**2, 0.25 * self.target**2))
+        """Standard error of pixels at which the whole error is the target, and no more than a fifth above it if it has
+        as much beside noise as may well be; half of the target where that is out of reach."""
+        floor, target = self.chosen.floor, self.target
+        likely, safe = target**2 - floor.value**2, (SLACK * target) ** 2 - floor.high**2
+        return math.sqrt(min(likely, safe) if min(likely, safe) > 0.0 else max(likely, 0.25 * target**2))
 
     @property
     def planned(self) -> Scene:

@@ -6,13 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from tsdf.plan.choice import swamped
-from tsdf.plan.prediction import BLOCK, TIE, UNFINISHED, Plan, Prediction
+from tsdf.plan.choice import Wish, choose, swamped
+from tsdf.plan.prediction import BLOCK, UNFINISHED, Plan, Prediction
 from tsdf.plan.prior import Body
 
 TARGETS = np.geomspace(0.002, 0.5, 120)  # [1] that are tried for what would change a plan's mind
 BUSY = 1.5  # times as long as on processors that have nothing else to do, from which on it is said
 MEANINGFUL = 0.5  # [1] above which the error of a pixel says little: a few glints make it
+HELPS = 2.0  # times as much error as under a wider sun there has to be for that to be said
+ABOVE = 1.05  # times the target, that an error may have to be for it to be said
 OTHER = 1.2  # times as high or low as its target, from which on another target is another wish
 
 
@@ -73,14 +75,20 @@ def span(seconds: float) -> str:
     return f"{seconds / 86400.0:.3g} days"
 
 
-def _about(seconds: float) -> str:
-    return span(seconds) if seconds < 0.01 else f"about {span(seconds)}"
+def by_clock(plan: Plan, seconds: float) -> str:
+    """Return how long it takes on processors as busy as they are now, what free ones do in so long [s]."""
+    return span(seconds * plan.load)
+
+
+def _about(plan: Plan, seconds: float) -> str:
+    said = by_clock(plan, seconds)
+    return said if said.startswith("less") else f"about {said}"
 
 
 def _first(plan: Plan) -> str:
     p = plan.chosen
     far = ", fewer where a pixel covers more" if plan.fewer_far else ""
-    takes = p.seconds(plan.target)
+    takes = p.done(plan.target)
     if math.isinf(p.variance):
         return f"take {p.candidate}{far}: nothing is known of its noise"
     if plan.spp is not None:
@@ -89,35 +97,69 @@ def _first(plan: Plan) -> str:
         met = f"{percent(p.floor.value)} of it is not noise"
     elif plan.seconds is not None and plan.able is not None:
         after = f"an error of {percent(p.error(plan.able))} after {span(plan.seconds)}"
-        met = f"none is sure to meet {percent(plan.target)} in that time, and {_left(plan, plan.able)}"
+        met = f"none is sure to meet {percent(plan.target)} then; {_left(plan, plan.able)}"
         if takes <= plan.able:
-            met = f"{percent(plan.target)} after {_about(takes)}"
+            met = f"{percent(plan.target)} after {_about(plan, takes)}"
     elif math.isinf(takes):
         after, met = f"an error of {percent(p.floor.value)} at best", f"none is sure to meet {percent(plan.target)}"
     else:
-        after = f"an error of {percent(plan.target)} after {_about(takes)}"
+        after = f"an error of {percent(plan.target)} after {_about(plan, takes)}"
         met = f"noise {percent(math.sqrt(max(plan.target**2 - p.floor.value**2, 0.0)))}"
     if (blocks := _of_blocks(plan)) is not None:
-        met += (
-            f"; that is of a pixel over the mean of the picture, means of {BLOCK} by {BLOCK} pixels are off by {blocks}"
-        )
+        met += f"; means of {BLOCK} by {BLOCK} pixels are off by {blocks}"
+    if (most := _at_most(plan)) is not None:
+        met += f"; up to {percent(most)} as far as is known"
     if p.floor.error > p.floor.value > plan.target:
-        met += f"; {within(p.floor.value, p.floor.error)} % of it is expected, not measured"
+        met += f"; {within(p.floor.value, p.floor.error)} % is expected, not measured"
     return f"take {p.candidate}{far}: {after} ({met})"
+
+
+def _at_most(plan: Plan) -> float | None:
+    """Return how large the error of a picture may be that is done when it is likely to have the target, where that is
+    more."""
+    p = plan.chosen
+    takes = p.done(plan.target)
+    if plan.spp is not None or math.isinf(takes) or (plan.able is not None and takes > plan.able):
+        return None
+    most = math.hypot(p.noise(takes), p.floor.high) if takes else p.floor.high
+    return most if most > ABOVE * plan.target else None
 
 
 def _left(plan: Plan, able: float) -> str:
     """Return what decides in a time in which no candidate meets the target."""
-    p, glints = plan.chosen, ""
+    said = []
     if plan.glints:
-        glints = "single grains, which meet suns by chance, would be mostly noise until "
-        glints += f"{span(plan.glints)}, so their glints are left out"
+        said.append(f"single grains would be mostly noise until {span(plan.glints)} and are left out")
     if plan.regional:
-        alike = "what all without single grains miss alike does not tell them apart: beside it means of "
-        alike += f"{BLOCK} by {BLOCK} pixels are off by {percent(p.error_of_regions(able))}, about the least of all "
-        alike += "with as much error"
-        return f"{glints}; {alike}" if glints else alike
-    return glints or "no other that was looked at is likely to have a tenth less"
+        off = percent(plan.chosen.error_of_regions(able))
+        said.append(f"means of {BLOCK} by {BLOCK} pixels are off by {off}, about the least")
+    return "; ".join(said) or "no other that was looked at is likely to have a tenth less"
+
+
+def wider_sun(plan: Plan) -> str | None:
+    """Return how wide suns would have to be for single grains, where these are left out because they meet suns too
+    seldom, by what pilots have seen under wider ones; None where that would not help."""
+    real, wide = plan.suns
+    if plan.able is None or plan.chosen.candidate.single or not plan.rarer > 1.0:
+        return None
+    ways = []
+    for p in plan.predictions:
+        if p.candidate.single and p.piloted and math.isfinite(p.variance):
+            noise = p.variance / plan.rarer * p.turn / plan.able  # squared, under the suns of pilots
+            more = min(max((plan.target**2 - p.floor.value**2) / noise, 1.0), plan.rarer)  # as it may be
+            error = max(math.hypot(p.floor.value, math.sqrt(more * noise)), plan.target)
+            degrees = wide * (real / wide) ** (math.log(more) / math.log(plan.rarer))
+            ways.append((round(error, 6), degrees, str(p.candidate)))
+    if not ways:
+        return None
+    error, degrees, which = min(ways)
+    if error > UNFINISHED or HELPS * error > plan.chosen.error(plan.able):
+        return None
+    return (
+        f"single grains meet a sun of {real:.2g} degrees too seldom to be taken; with angular_diameter_deg = "
+        f"{digits(degrees)}, as bright, {which} would show them, with an error of about {percent(error)} after "
+        f"{span(plan.seconds or 0.0)}"
+    )
 
 
 def _of_blocks(plan: Plan) -> str | None:
@@ -136,7 +178,7 @@ def to_noise(plan: Plan, noise: float) -> str:
     p = plan.chosen
     if not 0.0 < p.variance < math.inf:
         return _first(plan)
-    after = _about(p.seconds(noise, 0.0))
+    after = _about(plan, p.seconds(noise, 0.0))
     missed = f"beside which it misses {percent(p.floor.value)}" if p.floor.high else "and nothing else is wrong"
     return f"take {p.candidate}: noise of {percent(noise)} after {after}, {missed}"
 
@@ -168,16 +210,18 @@ def _other(plan: Plan) -> str:
         return "no other candidate is possible"
     if plan.able is not None and plan.spp is None and not plan.chosen.seconds(plan.target) <= plan.able:
         return _short_of_time(plan, plan.able)
-    second, chosen = plan.predictions[1], plan.chosen
-    takes = second.safe_seconds(plan.target)
-    runner = f"runner-up: {second.candidate}, {span(takes)}" if math.isfinite(takes) else (
+    chosen = plan.chosen
+    second = min(plan.predictions[1:], key=lambda p: (p.sure_seconds(plan.target), p.floor.value))
+    takes = second.sure_seconds(plan.target)
+    runner = f"runner-up: {second.candidate}, {by_clock(plan, takes)}" if math.isfinite(takes) else (
         f"runner-up: {second.candidate}, error {percent(second.floor.value)} at best"
     )  # fmt: skip
+    if math.isfinite(takes) and takes < chosen.sure_seconds(plan.target) and _at_most(plan) is not None:
+        runner += ", which is surer"
     flips = {}
     for target in TARGETS:
-        best = min(plan.predictions, key=lambda p: p.safe_seconds(float(target)))
-        takes = best.safe_seconds(float(target))
-        if math.isfinite(takes) and chosen.safe_seconds(float(target)) > TIE * takes:
+        best = choose(list(plan.predictions), Wish(float(target), math.inf))[0]
+        if best is not chosen and math.isfinite(best.done(float(target))):
             flips[float(target)] = best
     lower = [t for t in flips if OTHER * t < plan.target]
     upper = [t for t in flips if t > OTHER * plan.target]
@@ -208,20 +252,18 @@ def _short_of_time(plan: Plan, able: float) -> str:
         if abs(second.error(able) - plan.chosen.error(able)) < alike:
             runner += ", which is the same as far as can be told"
     best = min(plan.predictions, key=lambda p: p.safe_seconds(plan.target))
-    takes = best.safe_seconds(plan.target) * plan.load
+    takes = best.safe_seconds(plan.target)
     if not math.isfinite(takes):
         return f"{runner}; no time is known to be enough for {percent(plan.target)}"
-    busy = " on processors as busy as now" if plan.load >= BUSY else ""
-    more = f"{best.candidate} and {span(takes)} instead of {span(plan.seconds)}{busy}"
+    more = f"{best.candidate} and {by_clock(plan, takes)} instead of {span(plan.seconds)}"
     return f"{runner}; {percent(plan.target)} would take {more}"
 
 
 def table(plan: Plan) -> list[str]:
     """Return a table of all candidates as lines of text."""
     after = plan.able
-    free, now = ("", "") if plan.load < BUSY else (", idle", ", busy")  # processors
-    head = ["candidate", "bias %", "texture %", "error at best %", f"time to {percent(plan.target)}{free}"]
-    head += [f"error after {span(plan.seconds)}{now}"] if plan.seconds is not None else []
+    head = ["candidate", "bias %", "texture %", "error at best %", f"time to {percent(plan.target)}"]
+    head += [f"error after {span(plan.seconds)}"] if plan.seconds is not None else []
     rows = [[*head, "by"]]
     for p in plan.predictions:
         row = [
@@ -229,7 +271,7 @@ def table(plan: Plan) -> list[str]:
             within(p.bias, p.bias_error),
             within(p.texture, p.texture_error),
             within(p.floor.value, p.floor.error),
-            _when(p, plan.target),
+            _when(plan, p),
         ]
         row += [percent(p.error(after))] if after is not None else []
         rows.append([*row, "pilot" if p.piloted else "others"])
@@ -237,11 +279,11 @@ def table(plan: Plan) -> list[str]:
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-def _when(p: Prediction, target: float) -> str:
-    takes = p.seconds(target)
+def _when(plan: Plan, p: Prediction) -> str:
+    takes = p.seconds(plan.target)
     if math.isinf(p.variance):
         return "not known"
-    return span(takes) if math.isfinite(takes) else "never"
+    return by_clock(plan, takes) if math.isfinite(takes) else "never"
 
 
 def facts(plan: Plan) -> dict[str, Any]:
@@ -300,7 +342,7 @@ def chosen_facts(plan: Plan) -> dict[str, Any]:
 
 
 def options(plan: Plan) -> str:
-    """Return the options of ``tsdf-render`` that fix what is chosen."""
+    """Return the options of ``tsdf-render`` that name what is chosen."""
     one = plan.chosen.candidate
     words = f"--level {one.level}"
     if one.explicit_grains:
@@ -311,6 +353,7 @@ def options(plan: Plan) -> str:
 
 
 def notes(plan: Plan) -> tuple[str, ...]:
-    """Return what ``tsdf-render`` says of a plan: what it takes and how that is fixed, why, what it does not know."""
-    fixed = f"level auto: {plan.why[0]}; {options(plan)} fixes it"
-    return fixed, *plan.why[1:2], *plan.notes, *plan.needs
+    """Return what ``tsdf-render`` says of a plan: what it takes, how to have the same again, why, what it does not
+    know."""
+    again = f"to have the same again without planning: {options(plan)}"
+    return f"level auto: {plan.why[0]}", again, *plan.why[1:2], *plan.notes, *plan.needs
