@@ -21,6 +21,7 @@ from tsdf.plan.choice import Wish, choose
 from tsdf.plan.pilot import Apart, Clocks, Pilot
 from tsdf.plan.planner import plan
 from tsdf.plan.prediction import TIE, Plan, Prediction
+from tsdf.plan.prior import Body
 from tsdf.reference_data.make_checks import CHECKS
 from tsdf.scene.levels import LEVELS
 from tsdf.scene.scene import (
@@ -757,6 +758,20 @@ def test_what_may_be_a_little_above_its_target_is_said(far: Plan) -> None:
         assert math.hypot(made.noise, floor.high) <= 1.2 * 0.02 + 1e-9
         assert one.done(0.02) == pytest.approx((0.0144 / made.noise) ** 2)
     assert not replace(near, floor=Belief(0.0138, 0.011)).reaches(0.02)
+
+
+def test_why_not_another(far: Plan) -> None:
+    """Beside the chosen stands what is faster and misses more; of what is likely better but was not looked at, that."""
+    chosen, worse = candidate("teleport-memory", 0.04, 0.02), candidate("volume", 0.01, 0.05)
+    unseen = replace(candidate("isotropic", 0.02, 0.01), piloted=False)
+
+    def why(*found: Prediction) -> str:
+        made = replace(far, predictions=(chosen, *found), target=0.05, seconds=None)
+        return report._reason(made, [Body(0.5, 6.0, 0.8, 1.0, 40.0)], 1.0, 1.0, "explicit")
+
+    assert "volume has a bias" in why(worse) and "faster to the same noise" in why(worse) and "seen it" not in why(worse)
+    assert "isotropic may be faster and miss less, but no pilot has seen it" in why(worse, unseen)
+    assert "nothing takes less" in why(candidate("explicit", 0.5))
 
 
 def test_all_times_are_of_one_kind(far: Plan) -> None:

@@ -199,10 +199,13 @@ def _reason(plan: Plan, bodies: Sequence[Body], footprint: float, coverage: floa
         after = chosen.turn * plan.spp
     after = after if 0.0 < after < math.inf else 1.0
     noise = chosen.noise(after)
-    worse = [p for p in plan.predictions[1:] if p.noise(after) < noise and p.floor.high > 0.0]
-    nearest = min(worse, key=lambda p: p.floor.value, default=None)
-    than = f"; {short(nearest)}, and is faster to the same noise" if nearest is not None else "; nothing takes less"
-    return f"because {where}; {short(chosen)}{than}"
+    faster = [p for p in plan.predictions[1:] if p.noise(after) < noise and p.floor.high > 0.0]
+    nearest = min((p for p in faster if p.floor.high > chosen.floor.high), key=lambda p: p.floor.value, default=None)
+    than = f"; {short(nearest)}, and is faster to the same noise" if nearest is not None else ""
+    unseen = [p for p in faster if not p.piloted and p.floor.value < chosen.floor.value]
+    best = min(unseen, key=lambda p: p.floor.high, default=None)
+    than += f"; {best.candidate} may be faster and miss less, but no pilot has seen it" if best is not None else ""
+    return f"because {where}; {short(chosen)}{than or '; nothing takes less'}"
 
 
 def _other(plan: Plan) -> str:
