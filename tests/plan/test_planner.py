@@ -769,7 +769,9 @@ def test_why_not_another(far: Plan) -> None:
         made = replace(far, predictions=(chosen, *found), target=0.05, seconds=None)
         return report._reason(made, [Body(0.5, 6.0, 0.8, 1.0, 40.0)], 1.0, 1.0, "explicit")
 
-    assert "volume has a bias" in why(worse) and "faster to the same noise" in why(worse) and "seen it" not in why(worse)
+    assert (
+        "volume has a bias" in why(worse) and "faster to the same noise" in why(worse) and "seen it" not in why(worse)
+    )
     assert "isotropic may be faster and miss less, but no pilot has seen it" in why(worse, unseen)
     assert "nothing takes less" in why(candidate("explicit", 0.5))
 
