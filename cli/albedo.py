@@ -145,7 +145,7 @@ def main(  # noqa: PLR0913 - an argument for each option
         *found.notes,
     ]
     worst = max(float(result.reflectance_error.max()), float(result.transmittance_error.max()))
-    short = work.stop.is_set() and (worst > error if paths is None else result.paths < paths)
+    short = work.stop.is_set() and not result.finished
     if short:
         asked_for = f"an error of {error:g}" if paths is None else f"{paths} paths"
         notes.insert(

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from tsdf.data.table import Table
 from tsdf.grain.constants import constants_over
 from tsdf.grain.grains import load_grain
 from tsdf.grain.optics import Optics
@@ -18,9 +19,13 @@ RADIUS = 2e-4  # [m]
 PHOTONS = 400_000
 
 
+def sphere(eta: float) -> Table:
+    return exact_sphere(load_grain("sphere"), Optics(eta), Effort(cells=256))
+
+
 def dark(n: float, k: float) -> tuple[Family, Spectrum]:
     """Return opaque spheres of one index and what they do to light."""
-    family = Family((exact_sphere(load_grain("sphere"), Optics(n), Effort()),))
+    family = Family((sphere(n),))
     constants = Constants(np.array([3000.0]), np.array([n]), np.array([k]), "something dark", "this test")
     return family, spectra.spectrum(family, constants, RADIUS)
 
@@ -63,7 +68,7 @@ def test_opaque_spheres_are_what_their_surface_is(n: float, k: float) -> None:
     assert masses[0] @ (0.5 * (edges[1:] + edges[:-1])) == pytest.approx(found.g[0], abs=2e-3)
     assert "at 3000 nm k changes what the surface sends back" in found.notes[0]
     assert found.error("albedo")[0] < 1e-3  # nothing comes through
-    alone = found.surface.albedo_of_n[0], family.tables[0].mean_cosine(float(found.absorption_times_radius[0]))
+    alone = found.albedo_of_tables[0, 0], family.tables[0].mean_cosine(float(found.absorption_times_radius[0]))
     assert abs(found.albedo[0] - alone[0]) > 0.05 and abs(found.g[0] - alone[1]) > 0.03
 
 
@@ -79,19 +84,62 @@ def test_a_half_space_of_opaque_spheres() -> None:
     assert got.reflectance[0] - got.theories.surface.reflectance[0] < 0.1 * truth
 
 
-def test_light_that_comes_through_is_in_the_error() -> None:
-    """Thin spheres: what k changes is put in, and as much of it may be wrong as of the light comes through; of a grain
-    that is not convex, as much as it sends back to itself. Where k is nothing a table's own numbers stay to the bit."""
-    family, found = dark(1.3, 0.02)
-    thin = spectra.spectrum(family, found.constants, 2e-6)
-    n_alone = thin.surface.albedo_of_n
-    assert thin.error("albedo")[0] >= 0.5 * abs(thin.albedo[0] - n_alone[0]) > 0.0
-    rough = Surface(thin.surface.n, thin.surface.k, np.zeros(1), 0.8)
-    assert rough.unsure == pytest.approx([0.2])
+@pytest.mark.parametrize("radius", [5e-7, 2e-6, 1e-5, 1e-4])
+def test_light_that_comes_through_is_in_the_error(radius: float) -> None:
+    """Spheres that let light through, with the reflectance of n - i k at each meeting: the albedo is within its error,
+    which is more than nothing; of n alone it is not, in the opaque one."""
+    n, k = 1.33, 0.3
+    family, _ = dark(n, k)
+    constants = Constants(np.array([3000.0]), np.array([n]), np.array([k]), "something dark", "this test")
+    found = spectra.spectrum(family, constants, radius)
+    cosine = np.sqrt((np.arange(20_000) + 0.5) / 20_000)
+    sent = reflectance(cosine, np.full(20_000, n), np.full(20_000, k))
+    chord = 2.0 * np.sqrt(1.0 - (1.0 - cosine**2) / n**2)
+    left = np.exp(-float(found.absorption_times_radius[0]) * chord)
+    truth = float((sent + (1.0 - sent) ** 2 * left / (1.0 - sent * left)).mean())
+    assert abs(found.albedo[0] - truth) <= found.error("albedo")[0] + 1e-5
+    if radius >= 1e-5:
+        assert found.error("albedo")[0] < 1e-6 < abs(truth - found.albedo_of_tables[0, 0])
+
+
+def test_what_is_not_felt_stays_to_the_bit() -> None:
+    """Where k is nothing a table's own numbers stay; of grains that are not convex as much is unsure as they send back
+    to themselves."""
+    family, _ = dark(1.3, 0.5)
+    rough = Surface(np.array([1.3]), np.array([0.5]), np.array([1.3]), 0.8)
+    opaque = float(rough.whole[0][0, 0])
+    assert rough.unsure(np.ones((1, 1)), np.array([opaque])) == pytest.approx([0.2])
     ice = Constants.of(constants_over("ice", [400.0]))
     clear = spectra.spectrum(family, ice, RADIUS)
     assert clear.albedo[0] == spectra.absorbed(family.tables[0], clear.absorption_times_radius)[0, 0]
     assert not any("surface" in note for note in clear.notes)
+
+
+def test_opaque_grains_do_not_mind_the_index_of_their_tables() -> None:
+    """Of a table of another n, of a family between its indices and of n = 1, where nothing is sent back without k: what
+    opaque grains do follows from n and k alone, and every number is one."""
+    glass, around = Family((sphere(1.52),)), Family(tuple(sphere(eta) for eta in (0.96, 1.0, 1.2, 1.44)))
+    for family, n, k in ((glass, 0.5, 3.0), (around, 1.0355, 0.4293), (around, 1.0, 2.0)):
+        constants = Constants(np.array([3000.0]), np.array([n]), np.array([k]), "something dark", "this test")
+        found = spectra.spectrum(family, constants, RADIUS)
+        turn, sent = deflections(np.random.default_rng(3), PHOTONS, n, k)
+        assert found.albedo[0] == pytest.approx(float(sent.mean()), abs=1e-3)
+        assert found.g[0] == pytest.approx(float((turn * sent).sum() / sent.sum()), abs=0.006)
+        assert found.error("albedo")[0] < 2e-3
+        edges, masses = family.masses(found)
+        assert masses.sum() == pytest.approx(1.0)
+        assert masses[0] @ (0.5 * (edges[1:] + edges[:-1])) == pytest.approx(found.g[0], abs=3e-3)
+        assert spectra.moments_of(family, found, 4)[0][0, 1] == pytest.approx(found.g[0], abs=1e-3)
+
+
+def test_layers_of_opaque_grains_add_up() -> None:
+    """What comes back of a half-space and what its layers absorb is all of the light."""
+    family, found = dark(1.4375, 0.5812)
+    request = slabs.Request("volume", depths=4, profile_depth=40.0)
+    got = slabs.measure(family, found, request, paths=8192, threads=2)
+    error = math.hypot(got.reflectance_error[0], float(np.hypot.reduce(got.profile_error[:, 0])))
+    assert got.reflectance[0] + got.profile.sum() == pytest.approx(1.0, abs=4.0 * error + 1e-3)
+    assert got.theories.surface.reflectance[0] > 0.005
 
 
 def test_reflectance_of_a_mirror_and_of_clear_surfaces() -> None:

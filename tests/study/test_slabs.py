@@ -265,6 +265,17 @@ def test_doubling_of_diffuse_light() -> None:
     assert streams.doubled(np.full(1, math.inf), np.ones(1), moments[:1], None).reflectance[0] > 0.999
 
 
+def test_doubling_of_thick_slabs() -> None:
+    """Lossless slabs up to a million deep lose nothing to 1e-6, and let 4/3 / ((1 - g) tau + 1.42) of diffuse light
+    through."""
+    g, tau = np.array([0.0, 0.9]), np.array([1e4, 1e5, 1e6])
+    for one in g:
+        moments = np.tile(one ** np.arange(streams.ORDERS + 1.0), (3, 1))
+        reflected, passed = streams.doubled(tau, np.ones(3), moments, None)
+        assert reflected + passed == pytest.approx(np.ones(3), abs=1e-6)
+        assert passed == pytest.approx(4.0 / 3.0 / ((1.0 - one) * tau + 1.42), rel=0.01, abs=5e-7)
+
+
 # ------------------------------------------------------------------------------------------------ bad input
 
 

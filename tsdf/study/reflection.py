@@ -4,12 +4,14 @@ Tables are made with n alone, and absorption only takes from the light that went
 as of ice near 3 um, metals and dyes, the surface itself sends back more; grains are opaque then.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 NODES = 8  # in a cell
+BATCH = 64  # wavelengths at once, for memory
+FELT = 1e-4  # k over n below which a surface does not know of it: 1e-8 of the light
 TINY = 1e-12
 
 
@@ -19,7 +21,7 @@ def reflectance(cosine: np.ndarray, n: np.ndarray, k: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     cosine, n, k : float64
-        Of the angle of incidence, in [0, 1], and of the matter behind; of shapes that go together.
+        Of the angle of incidence, in (0, 1], and of the matter behind; of shapes that go together.
     """
     m = n - 1j * k
     inside = np.sqrt(1.0 - (1.0 - cosine**2) / m**2)
@@ -27,81 +29,98 @@ def reflectance(cosine: np.ndarray, n: np.ndarray, k: np.ndarray) -> np.ndarray:
     return np.asarray(0.5 * (np.abs(s) ** 2 + np.abs(p) ** 2), np.float64)
 
 
+def sent_back(edges: np.ndarray, n: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """Return the share of the light that convex grains send back from outside into each cell, (w, columns) float64.
+
+    Turned to all sides they send it back as a ball does (van de Hulst 1957, 8.4): of all directions equally much meets
+    them, and cos theta is 1 - 2 cos^2 of the angle of incidence.
+
+    Parameters
+    ----------
+    edges : (columns + 1,) float64
+        Of cos theta, ascending.
+    n, k : (w,) float64
+    """
+    at, weight = np.polynomial.legendre.leggauss(NODES)
+    angle = np.sqrt(np.maximum(0.5 * (1.0 - edges), 0.0))  # cosines of incidence, in which grazing light is smooth
+    half = 0.5 * (angle[:-1] - angle[1:])
+    cosine = np.maximum((angle[1:] + half)[:, None] + half[:, None] * at, TINY)
+    weight = 2.0 * cosine * half[:, None] * weight
+    found = np.zeros((len(n), len(half)))
+    for some in range(0, len(n), BATCH):
+        here = slice(some, some + BATCH)
+        found[here] = (reflectance(cosine, n[here, None, None], k[here, None, None]) * weight).sum(axis=2)
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """What k makes of the light that a surface sends back outside, by wavelength: tables are made with n alone.
+    """What k makes of the light that grains send back outside, by wavelength, beside tables that are made with n alone.
 
-    Convex grains turned to all sides send it back as a ball does (van de Hulst 1957, 8.4): of all directions equally
-    much meets them, and cos theta is 1 - 2 cos^2 of the angle of incidence. What is let in is less by as much, and
-    the rest of it is left as it is: exact where no light comes through.
+    Light that is let in, and out again or back, is less or more by as much each time: exact where grains are convex and
+    no light comes through.
 
     Attributes
     ----------
     n, k : (w,) float64
-    albedo_of_n : (w,) float64
-        As of n alone [1].
+    eta : (t,) float64
+        Of the tables.
     convexity : float
         Four times the mean projected area of a grain over its surface, 1 of convex ones [1].
     """
 
     n: np.ndarray
     k: np.ndarray
-    albedo_of_n: np.ndarray
+    eta: np.ndarray
     convexity: float = 1.0
 
-    @property
-    def of_n(self) -> "Surface":
-        """The same without k."""
-        return replace(self, k=np.zeros(len(self.n)))
-
-    def masses(self, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return what is sent back into each cell of cos theta as of n alone, and with k, (w, columns) float64."""
-        at, weight = np.polynomial.legendre.leggauss(NODES)
-        angle = np.sqrt(np.maximum(0.5 * (1.0 - edges), 0.0))  # cosines of incidence, in which grazing light is smooth
-        half = 0.5 * (angle[:-1] - angle[1:])
-        cosine = (angle[1:] + half)[:, None] + half[:, None] * at
-        weight = 2.0 * cosine * half[:, None] * weight
-        n, k = self.n[:, None, None], self.k[:, None, None]
-        without, whole = ((reflectance(cosine, n, some) * weight).sum(axis=2) for some in (np.zeros_like(k), k))
-        return without, whole
-
     @cached_property
-    def sent(self) -> np.ndarray:
-        """What is sent back, as of n alone and with k, and its cosine, (2, 2, w) float64."""
-        edges = np.linspace(-1.0, 1.0, 257)
-        both = np.array(self.masses(edges))
-        return np.stack([both.sum(axis=-1), both @ (0.5 * (edges[1:] + edges[:-1]))], axis=1)
-
-    @cached_property
-    def albedo(self) -> np.ndarray:
-        """With k, (w,) float64 [1]."""
-        return np.clip(self._energy(np.ones(len(self.n)), *self.sent[:, 0]), 0.0, 1.0)
-
-    @property
-    def changed(self) -> np.ndarray:
+    def felt(self) -> np.ndarray:
         """Where k changes anything, (w,) bool."""
-        return np.asarray((self.sent[0, 0] != self.sent[1, 0]) & (self.albedo > 0.0))
+        return np.asarray(self.k > FELT * self.n)
 
-    @property
-    def unsure(self) -> np.ndarray:
-        """Share of what k changes that may be wrong, (w,) float64 in [0, 1]: of light that is let in and comes out
-        again, and of what grains that are not convex send back to themselves."""
-        before = self.sent[0, 0]
-        through = np.clip((self.albedo_of_n - before) / np.maximum(1.0 - before, TINY), 0.0, 1.0)
-        return np.minimum(through + 1.0 - self.convexity, 1.0)
+    def sent(self, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what is sent back into each cell of cos theta, as in the tables, (t, columns), and with k where it is
+        felt, (felt, columns) float64."""
+        there = self.n[self.felt], self.k[self.felt]
+        return sent_back(edges, self.eta, np.zeros(len(self.eta))), sent_back(edges, *there)
 
-    def mean(self, values: np.ndarray, without: np.ndarray, whole: np.ndarray) -> np.ndarray:
-        """Return means (w, ...) over all that leaves, with k, of those as of n alone; `without` and `whole` are sums of
-        the same over what is sent back, as of n alone and with k."""
-        shape = (-1,) + (1,) * (values.ndim - 1)
-        changed = self.changed.reshape(shape)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.where(
-                changed, self._energy(np.nan_to_num(values), without, whole) / self.albedo.reshape(shape), values
-            )
+    @cached_property
+    def whole(self) -> tuple[np.ndarray, np.ndarray]:
+        """What is sent back in all, and its cosine, as in the tables, (t, 2), and with k, (felt, 2) float64."""
+        edges = np.linspace(-1.0, 1.0, 513)
+        one = np.stack([np.ones(512), 0.5 * (edges[1:] + edges[:-1])], axis=1)
+        tables, felt = self.sent(edges)
+        return tables @ one, felt @ one
 
-    def _energy(self, values: np.ndarray, without: np.ndarray, whole: np.ndarray) -> np.ndarray:
-        shape = (-1,) + (1,) * (values.ndim - 1)
-        (before, after), energy = self.sent[:, 0], values * self.albedo_of_n.reshape(shape)
-        let_in = ((1.0 - after) / np.maximum(1.0 - before, TINY)).reshape(shape)
-        return np.asarray(energy + (whole - without) + (let_in - 1.0) * (energy - without), np.float64)
+    def energy(
+        self, weights: np.ndarray, albedo: np.ndarray, of_n: np.ndarray, sent: tuple[np.ndarray, np.ndarray]
+    ) -> np.ndarray:
+        """Return energies (felt, ...) with k, over that which met the grain.
+
+        Parameters
+        ----------
+        weights : (felt, t) float64
+            Of tables.
+        albedo, of_n : (felt,), (felt, ...) float64
+            Albedo and these energies as of n alone.
+        sent : (t, ...), (felt, ...) float64
+            What of them is sent back, as in the tables, and with k.
+        """
+        (tables, felt), through = self.whole, self._through(weights, albedo)
+        before, after = weights @ tables[:, 0], felt[:, 0]
+        # what is left of light from one meeting of the surface to the next, where each sends back as much
+        left = through / np.maximum(1.0 - before + before * through, TINY)
+        more = (1.0 - after) ** 2 / np.maximum((1.0 - before) * (1.0 - before + before * through), TINY)
+        more = (more / np.maximum(1.0 - after * left, TINY)).reshape((-1,) + (1,) * (of_n.ndim - 1))
+        return np.asarray(sent[1] + more * (of_n - np.tensordot(weights, sent[0], axes=1)), np.float64)
+
+    def unsure(self, weights: np.ndarray, albedo: np.ndarray) -> np.ndarray:
+        """Return the share of what k changes that may be wrong, (felt,) float64 in [0, 1], for albedos of n alone: that
+        of light that comes through, and what grains that are not convex send back to themselves."""
+        return np.minimum(self._through(weights, albedo) + 1.0 - self.convexity, 1.0)
+
+    def _through(self, weights: np.ndarray, albedo: np.ndarray) -> np.ndarray:
+        """Return the share of the light that is let in as of n alone and comes out again, (felt,)."""
+        before = weights @ self.whole[0][:, 0]
+        return np.clip((albedo - before) / np.maximum(1.0 - before, TINY), 0.0, 1.0)

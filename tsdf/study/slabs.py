@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tsdf.compiled import njit
+from tsdf.data.phase import legendre
 from tsdf.data.table import Table
 from tsdf.errors import UsageError
 from tsdf.picture.media import DARKEST
@@ -123,6 +124,8 @@ class Albedo:
         Indices at which paths were followed.
     seconds : float
         Processor time.
+    finished : bool
+        Whether all paths that were asked for, or that the error takes, were followed.
     """
 
     reflectance: np.ndarray
@@ -136,6 +139,7 @@ class Albedo:
     paths: int
     eta: np.ndarray
     seconds: float
+    finished: bool
 
 
 def extinction(table: Table, packing_fraction: float, albedo: np.ndarray) -> np.ndarray:
@@ -432,6 +436,7 @@ def measure(
         )
     which = chosen(family)
     eta = family.eta[which]
+    told(0.0, "theories")
     weights, theories = lagrange(eta, n), _theories(family, found, request, which)
     sets = [
         [Paths.start(family.tables[t], request, light, x, len(request.lights) * number + k) for number, t in
@@ -450,11 +455,12 @@ def measure(
         whole = streams.Streams(
             *(np.clip(of + more, 0.0, 1.0) for of, more in zip(whole, theories.surface, strict=True))
         )
-        if len(profile) and math.isfinite(
-            request.thickness
-        ):  # where free paths depend on absorption, layers do not know
+        if len(profile) and math.isfinite(request.thickness):
+            # where free paths depend on absorption, layers do not know
             kept = whole.reflectance + (1.0 - request.ground) * whole.transmittance
             profile = profile * ((1.0 - kept) / np.maximum(profile.sum(axis=0), 1e-300))
+        elif len(profile):
+            profile = profile * ((1.0 - whole.reflectance) / np.maximum(1.0 - light.reflectance, 1e-300))
         return np.array(whole), profile
 
     threads = threads or os.cpu_count() or 1
@@ -484,10 +490,13 @@ def measure(
                 wanted = max(int(needed), done)
     whole, profile = result()
     profile_error = _jackknife([result(group)[1] for group in range(GROUPS)]) if request.depths else profile
-    error += found.surface.unsure * np.abs(theories.surface)
+    if (felt := found.surface.felt).any():
+        unsure = found.surface.unsure(family.weights(n[felt]), np.einsum(
+            "wt,tw->w", family.weights(n[felt]), found.albedo_of_tables[:, felt]))  # fmt: skip
+        error[:, felt] += unsure * np.abs(theories.surface)[:, felt]
     return Albedo(
         whole[0], whole[1], error[0], error[1], theories, profile, profile_error, flat[0].edges, done, eta,
-        sum(one.seconds for one in flat),
+        sum(one.seconds for one in flat), not following,
     )  # fmt: skip
 
 
@@ -527,9 +536,8 @@ def _theories(family: Family, found: Spectrum, request: Request, which: list[int
     def eddington(depth: np.ndarray, w: np.ndarray, cosine: np.ndarray) -> streams.Streams:
         return over(lambda mu: streams.two_streams(depth, w, cosine, mu))
 
-    def doubled(found: Spectrum, albedo: np.ndarray) -> streams.Streams:
-        moments, _ = moments_of(family, found, streams.ORDERS)
-        return over(lambda mu: streams.doubled(depth(albedo), albedo, moments, mu))
+    def doubled(depth: np.ndarray, albedo: np.ndarray, moments: np.ndarray) -> streams.Streams:
+        return over(lambda mu: streams.doubled(depth, albedo, moments, mu))
 
     single = [absorbed(table, x)[:2] for table in family.tables]
     each = np.array([
@@ -540,12 +548,18 @@ def _theories(family: Family, found: Spectrum, request: Request, which: list[int
     albedo = np.clip(albedo, 0.0, 1.0)
     between = np.abs(np.einsum("wt,tw->w", few, each) - eddington(depth(albedo), albedo, g).reflectance)
 
-    exact = doubled(found, found.albedo)
+    exact = doubled(depth(found.albedo), found.albedo, moments_of(family, found, streams.ORDERS)[0])
     surface = streams.Streams(np.zeros(len(n)), np.zeros(len(n)))
-    if found.surface.changed.any():
-        without = doubled(replace(found, surface=found.surface.of_n), found.surface.albedo_of_n)
-        surface = streams.Streams(*(np.where(found.surface.changed, a - b, 0.0) for a, b in
-                                    zip(exact, without, strict=True)))  # fmt: skip
+    if (felt := found.surface.felt).any():  # the tables that paths are followed at, as they are
+        paths = np.zeros((2, int(felt.sum())))
+        for i, t in enumerate(which):
+            table, w = family.tables[t], single[t][0][felt]
+            masses = np.array([table.deflection_masses(float(a)) for a in x[felt]])
+            moments = legendre(table.cos_theta_edges, masses, streams.ORDERS)
+            paths += few[felt, i] * doubled(request.thickness * extinction(table, f, w), w, moments)
+        for whole, of_paths, more in zip(exact, paths, surface, strict=True):
+            more[felt] = whole[felt] - of_paths
+        between[felt] = 0.0
 
     statistics = [table.statistics for table in family.tables]
     lossless, length = (full @ np.array([s[name] for s in statistics]) for name in ("mean_cosine", "mean_path_length"))

@@ -197,11 +197,15 @@ class Family:
         place = np.interp(found.constants.n, self.eta, np.arange(last + 1.0))
         for i, table in enumerate(self.tables):
             share = np.maximum(0.0, 1.0 - np.abs(place - i))
+            share = np.where(found.surface.felt, share * found.albedo_of_tables[i], share)
             for w in np.flatnonzero(share):
                 whole[w] += share[w] * table.deflection_masses(float(x[w]))
-        if found.surface.changed.any():
-            whole = np.maximum(found.surface.mean(whole, *found.surface.masses(edges)), 0.0)
-            whole /= whole.sum(axis=1, keepdims=True)
+        felt = found.surface.felt
+        if felt.any():
+            shares = np.maximum(0.0, 1.0 - np.abs(place[felt, None] - np.arange(last + 1.0)))
+            energy = found.surface.energy(shares, whole[felt].sum(axis=1), whole[felt], found.surface.sent(edges))
+            whole[felt] = np.maximum(energy, 0.0)
+            whole[felt] /= whole[felt].sum(axis=1, keepdims=True)
         return edges, whole
 
 
@@ -225,6 +229,8 @@ class Spectrum:
         What the reader should know, one line each.
     surface : Surface
         What k makes of the grain's surface, which `albedo` and `g` have; `moments_of` and `Family.masses`, too.
+    albedo_of_tables : (t, w) float64
+        Of each table at these absorptions, as of n alone.
     """
 
     constants: Constants
@@ -239,6 +245,7 @@ class Spectrum:
     between: dict[str, np.ndarray]
     notes: tuple[str, ...]
     surface: Surface
+    albedo_of_tables: np.ndarray
 
     def error(self, name: str) -> np.ndarray:
         """Return the error of albedo, g, enhancement or those of the far field."""
@@ -332,20 +339,29 @@ def spectrum(family: Family, constants: Constants, radius: float) -> Spectrum:
     found[0] = np.clip(found[0], 0.0, 1.0)
     # without a material k stands for an absorption of which nobody said a wavelength
     k = np.where(unknown, 0.0, constants.k) if constants.material else np.zeros(len(n))
-    surface = Surface(n, k, found[0].copy(), convexity(family.tables[0]))
-    of_surface = np.stack([surface.albedo, surface.mean(found[1], *surface.sent[:, 1])])
-    of_surface[0] = np.where(surface.changed, of_surface[0], found[0])
-    far = np.where(surface.changed, surface.unsure * np.abs(of_surface - np.nan_to_num(found[:2])), 0.0)
-    missed[:2] += far
-    found[:2] = of_surface
-    notable = np.abs(surface.sent[1, 0] - surface.sent[0, 0]) > NOTABLE
-    if notable.any():
-        there, most = constants.wavelength_nm[notable], np.abs(surface.sent[1, 0] - surface.sent[0, 0]).max()
-        where = f"at {there[0]:g}" if len(there) == 1 else f"between {there.min():g} and {there.max():g}"
-        notes.append(
-            f"{where} nm k changes what the surface sends back, by up to {most:.2g}: put in as of convex grains; what "
-            f"that may miss, up to {far[0].max():.1g} of the albedo and {far[1].max():.1g} of g, is in the errors"
-        )
+    surface = Surface(n, k, family.eta, convexity(family.tables[0]))
+    if (felt := surface.felt).any():
+        each = values[:, 0] * np.stack([np.ones_like(values[:, 0]), np.nan_to_num(values[:, 1])])  # (2, t, w)
+
+        def put(weights: np.ndarray) -> np.ndarray:
+            of_n = np.einsum("wt,qtw->wq", weights, each[:, :, felt])
+            energy = surface.energy(weights, of_n[:, 0], of_n, surface.whole)
+            return np.stack([np.clip(energy[:, 0], 0.0, 1.0), energy[:, 1] / np.maximum(energy[:, 0], 1e-300)])
+
+        of_n, with_k = np.nan_to_num(found[:2, felt]), put(weights[felt])
+        energy = np.einsum("wt,tw->w", weights[felt], each[0][:, felt])
+        far = surface.unsure(weights[felt], energy) * np.abs(with_k - of_n)
+        found[:2, felt] = with_k
+        missed[:2, felt] = far + (np.abs(put(coarser[felt]) - with_k) if coarser is not None else 0.0)
+        notable = np.abs(with_k[0] - of_n[0]) > NOTABLE
+        if notable.any():
+            there = constants.wavelength_nm[felt][notable]
+            where = f"at {there[0]:g}" if len(there) == 1 else f"between {there.min():g} and {there.max():g}"
+            notes.append(
+                f"{where} nm k changes what the surface sends back, the albedo by up to "
+                f"{np.abs(with_k[0] - of_n[0]).max():.2g}: put in as of convex grains; what that may miss, up to "
+                f"{far[0].max():.1g} of the albedo and {far[1].max():.1g} of g, is in the errors"
+            )
     if unknown.any():
         found[0, unknown] = noise[0, unknown] = missed[0, unknown] = math.nan
         notes.append(
@@ -357,7 +373,7 @@ def spectrum(family: Family, constants: Constants, radius: float) -> Spectrum:
     return Spectrum(
         constants, radius, x, found[0], found[1], np.where(unknown, math.nan, albedo_far), g_far, found[2],
         dict(zip(names, noise, strict=True)), dict(zip(names, missed, strict=True)), tuple(notes),
-        surface,
+        surface, values[:, 0],
     )  # fmt: skip
 
 
@@ -378,17 +394,22 @@ def moments_of(family: Family, found: Spectrum, orders: int) -> tuple[np.ndarray
     """Return Legendre moments by wavelength, (w, orders + 1) float64, and the share that goes straight on, (w,)."""
     x = np.where(np.isnan(found.absorption_times_radius), 0.0, found.absorption_times_radius)
     weights = family.weights(found.constants.n)
+    weights = np.where(found.surface.felt[:, None], weights * found.albedo_of_tables.T, weights)
     whole, straight = np.zeros((len(x), orders + 1)), np.zeros(len(x))
     for i, table in enumerate(family.tables):
         masses = np.array([table.deflection_masses(float(a)) for a in x])
         whole += weights[:, i, None] * legendre(table.cos_theta_edges, masses, orders)
         straight += weights[:, i] * masses[:, -1]
-    if found.surface.changed.any():
+    felt = found.surface.felt
+    if felt.any():
         edges = np.linspace(-1.0, 1.0, 4 * orders + 65)
-        sent = (legendre(edges, masses, orders) for masses in found.surface.masses(edges))
-        whole = found.surface.mean(whole, *sent)
-        whole[found.surface.changed] /= whole[found.surface.changed, :1]
-        straight = found.surface.mean(straight, np.zeros(len(x)), np.zeros(len(x)))
+        tables, here = (legendre(edges, masses, orders) for masses in found.surface.sent(edges))
+        shares = family.weights(found.constants.n[felt])
+        albedo = whole[felt, 0]
+        energy = found.surface.energy(shares, albedo, whole[felt], (tables, here))
+        none = np.zeros(len(family.tables)), np.zeros(int(felt.sum()))
+        straight[felt] = found.surface.energy(shares, albedo, straight[felt], none) / energy[:, 0]
+        whole[felt] = energy / energy[:, :1]
     return whole, np.clip(straight, 0.0, 1.0)
 
 

@@ -21,7 +21,7 @@ FEEBLE = 1e-12  # co-albedo of what does not absorb, so that nothing is 0 / 0
 DEEPEST = 300.0  # exponents beyond are all the same
 DIRECTIONS = 24  # of doubling, in each half of the sphere
 ORDERS = 2 * DIRECTIONS  # of Legendre moments that it takes
-THINNEST, THICKEST = 1e-8, 1e8  # optical depth of the layer that it begins with, and of a half-space
+THINNEST, THICKEST = 1e-5, 1e8  # optical depth of the layer that it begins with, and of a half-space
 
 
 class Streams(NamedTuple):
@@ -124,7 +124,7 @@ def doubled(depth: np.ndarray, albedo: np.ndarray, moments: np.ndarray, cosine: 
         Of the angle of incidence, in (0, 1]; None for diffuse light.
     """
     ahead = np.clip(moments[:, -1:], 0.0, 1.0 - FEEBLE)
-    w = np.minimum(albedo, 1.0 - FEEBLE)[:, None]
+    w = albedo[:, None]
     chi = (moments[:, :-1] - ahead) / (1.0 - ahead)
     tau, w = np.minimum((1.0 - w * ahead)[:, 0] * depth, THICKEST), w * (1.0 - ahead) / (1.0 - w * ahead)
     at, weight = np.polynomial.legendre.leggauss(DIRECTIONS)
@@ -144,7 +144,7 @@ def doubled(depth: np.ndarray, albedo: np.ndarray, moments: np.ndarray, cosine: 
         reflected, passed = r[more], t[more]
         between = np.linalg.solve(one - reflected @ reflected, passed)
         r[more], t[more] = reflected + passed @ reflected @ between, passed @ between
-    up, down = r.sum(axis=2), t.sum(axis=2)
+    up, down = np.clip(r.sum(axis=2), 0.0, 1.0), np.clip(t.sum(axis=2), 0.0, 1.0)
     if cosine is not None:
         return Streams(up[:, -1], down[:, -1])
     return Streams(2.0 * up @ (weight * mu), 2.0 * down @ (weight * mu))
