@@ -8,6 +8,7 @@ from click.testing import CliRunner, Result
 
 from tsdf.cli.preview import main
 from tsdf.cli.spectral import is_table
+from tsdf.errors import FormatError
 from tsdf.reference_data.make_checks import CHECKS
 
 CUBE = CHECKS / "cube_memory.tsdf.exr"
@@ -60,6 +61,8 @@ def test_refused_in_one_line(
 
 def test_a_ready_table_by_name() -> None:
     """It is taken for a table, unlike a built-in grain and what is neither; what is of grains alone is refused."""
-    assert is_table("sugar") and is_table("x.tsdf.exr") and not is_table("sand") and not is_table("sugra")
+    assert is_table("sugar") and is_table("x.tsdf.exr") and not is_table("sand")
+    with pytest.raises(FormatError, match="did you mean sugar"):
+        is_table("sugra")
     result = run("sugar", "--eta", 1.5)
     assert result.exit_code == 2 and "not of a table" in result.stderr

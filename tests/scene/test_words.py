@@ -26,7 +26,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tsdf_format.write(Table(header, table.pixels), place / "half.tsdf.exr")
     tsdf_format.write(table, place / "ball.tsdf.exr")
     (place / "own.csv").write_text("wavelength_nm,n,k\n300,1.5,1e-6\n900,1.5,1e-6\n")
-    (place / "short.csv").write_text("wavelength_nm,n,k\n400,1.5,1e-6\n900,1.5,1e-6\n")
+    (place / "short.csv").write_text("wavelength_nm,n,k\n450,1.5,1e-6\n900,1.5,1e-6\n")
     (place / "clear.csv").write_text("wavelength_nm,n\n300,1.5\n900,1.5\n")
     return place
 
@@ -106,7 +106,7 @@ def test_own_constants_are_files_of_the_scene(folder):
         (None, {"albedo": 0.5, "deep_colour": 0.5}, "albedo and deep_colour both say how grains absorb"),
         (None, {"albedo": 0.5, "absorption": 1.0}, "albedo and absorption both say how grains absorb"),
         (None, {"absorption": {"albedo": 0.9, "thickness": 2.0}}, "a slab 4 R thick of this grain reflects"),
-        (None, {"absorption": {"material": "short.csv"}}, "short.csv: says k from 400 to 900 nm only"),
+        (None, {"absorption": {"material": "short.csv"}}, "short.csv: says k from 450 to 900 nm only"),
         (None, {"absorption": {"material": "clear.csv"}}, "clear.csv: does not say k"),
     ],
 )  # fmt: skip

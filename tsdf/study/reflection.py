@@ -12,6 +12,7 @@ import numpy as np
 NODES = 8  # in a cell
 BATCH = 64  # wavelengths at once, for memory
 FELT = 1e-4  # k over n below which a surface does not know of it: 1e-8 of the light
+LEAST = 1e-6  # of the light, that is told from none
 TINY = 1e-12
 
 
@@ -112,8 +113,12 @@ class Surface:
         # what is left of light from one meeting of the surface to the next, where each sends back as much
         left = through / np.maximum(1.0 - before + before * through, TINY)
         more = (1.0 - after) ** 2 / np.maximum((1.0 - before) * (1.0 - before + before * through), TINY)
-        more = (more / np.maximum(1.0 - after * left, TINY)).reshape((-1,) + (1,) * (of_n.ndim - 1))
-        return np.asarray(sent[1] + more * (of_n - np.tensordot(weights, sent[0], axes=1)), np.float64)
+        more = np.where(1.0 - before > LEAST, more / np.maximum(1.0 - after * left, TINY), 0.0)
+        # grains that take back what they send send back less than convex ones
+        fewer = (before > LEAST) & (albedo < before)
+        sends = np.where(fewer, np.maximum(albedo, 0.0) / np.where(fewer, before, 1.0), 1.0)
+        more, sends = (some.reshape((-1,) + (1,) * (of_n.ndim - 1)) for some in (more, sends))
+        return np.asarray(sends * sent[1] + more * (of_n - sends * np.tensordot(weights, sent[0], axes=1)), np.float64)
 
     def unsure(self, weights: np.ndarray, albedo: np.ndarray) -> np.ndarray:
         """Return the share of what k changes that may be wrong, (felt,) float64 in [0, 1], for albedos of n alone: that

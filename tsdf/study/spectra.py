@@ -204,8 +204,7 @@ class Family:
         if felt.any():
             shares = np.maximum(0.0, 1.0 - np.abs(place[felt, None] - np.arange(last + 1.0)))
             energy = found.surface.energy(shares, whole[felt].sum(axis=1), whole[felt], found.surface.sent(edges))
-            whole[felt] = np.maximum(energy, 0.0)
-            whole[felt] /= whole[felt].sum(axis=1, keepdims=True)
+            whole[felt] = np.nan_to_num(_over(np.maximum(energy, 0.0), np.maximum(energy, 0.0).sum(axis=1)))
         return edges, whole
 
 
@@ -255,6 +254,12 @@ class Spectrum:
             w, g = self.albedo, np.where(self.albedo > 0.0, self.g, 0.0)
             return np.hypot(w * self.error("g"), (g - self.g_far) * self.error("albedo")) / (1.0 + w)
         return self.noise[name] + self.between[name]
+
+
+def _over(energy: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Return means (w, ...) of energies over all that leaves (w,), not a number where nothing does."""
+    whole = np.where(whole > 0.0, whole, math.nan).reshape((-1,) + (1,) * (energy.ndim - 1))
+    return np.asarray(energy / whole)
 
 
 def convexity(table: Table) -> float:
@@ -346,7 +351,7 @@ def spectrum(family: Family, constants: Constants, radius: float) -> Spectrum:
         def put(weights: np.ndarray) -> np.ndarray:
             of_n = np.einsum("wt,qtw->wq", weights, each[:, :, felt])
             energy = surface.energy(weights, of_n[:, 0], of_n, surface.whole)
-            return np.stack([np.clip(energy[:, 0], 0.0, 1.0), energy[:, 1] / np.maximum(energy[:, 0], 1e-300)])
+            return np.stack([np.clip(energy[:, 0], 0.0, 1.0), _over(energy[:, 1], energy[:, 0])])
 
         of_n, with_k = np.nan_to_num(found[:2, felt]), put(weights[felt])
         energy = np.einsum("wt,tw->w", weights[felt], each[0][:, felt])
@@ -408,8 +413,8 @@ def moments_of(family: Family, found: Spectrum, orders: int) -> tuple[np.ndarray
         albedo = whole[felt, 0]
         energy = found.surface.energy(shares, albedo, whole[felt], (tables, here))
         none = np.zeros(len(family.tables)), np.zeros(int(felt.sum()))
-        straight[felt] = found.surface.energy(shares, albedo, straight[felt], none) / energy[:, 0]
-        whole[felt] = energy / energy[:, :1]
+        straight[felt] = np.nan_to_num(_over(found.surface.energy(shares, albedo, straight[felt], none), energy[:, 0]))
+        whole[felt] = np.nan_to_num(_over(energy, energy[:, 0]))
     return whole, np.clip(straight, 0.0, 1.0)
 
 
