@@ -266,6 +266,16 @@ def test_a_furnace_seen_along_a_face(level, folder, ball):
     assert (take(scene_of([Mesh(folder / "box.ply")], ball, speck, camera=along), level, 16).rgb == 1.0).all()
 
 
+@pytest.mark.parametrize("fov", [0.01, 0.001])
+def test_a_wall_seen_along_a_face(fov, folder, ball):
+    """No ray is begun so far along the face that a wall in front of the camera is passed over: all above the face is
+    black, by a wall a hundredth away and a thickness of .003 long."""
+    along = Camera((0.5, -1.0, 4.0), (1.5, 0.0, 4.0), 16, 24, fov_deg=fov)
+    wall = black(Box((0.51, -4.0, 3.0), (0.513, 3.0, 5.0)))
+    picture = take(scene_of([Mesh(folder / "box.ply")], ball, wall, camera=along), "volume", 8)
+    assert (picture.rgb[:12] == 0.0).all()
+
+
 # -------------------------------------------------------------------------------------------------- leaks
 
 FLOOR = Rectangle((0.0, 0.0, -4.0), (1000.0, 0.0, 0.0), (0.0, 1000.0, 0.0))

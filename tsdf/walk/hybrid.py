@@ -29,7 +29,7 @@ LEAST_COSINE = 0.2  # mean cosine of grains below which light often comes back t
 @njit(**KERNEL)
 def hand_over(world, w):
     """Have a walker that has just left a packed grain's bounding sphere, with centre w.q, go on by a world's law."""
-    w.skip = 0.0
+    w.skip, w.tries = 0.0, 0
     if world.media.traits.remembers:
         n = step(triple(w.p), -1.0, triple(w.q))
         size = 1.0 / world.memory.radius[w.medium]

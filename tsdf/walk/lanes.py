@@ -457,7 +457,7 @@ def note(batch, lanes, i):
     w.weight, w.luck, w.pdf = numbers[at(WEIGHT, i)], numbers[at(LUCK, i)], numbers[at(PDF, i)]
     w.free, w.skip, w.key, w.events = numbers[at(FREE, i)], 0.0, words[at(KEY, i)], np.int64(words[at(MET, i)])
     w.sample, w.ray, w.medium, w.mode = np.int64(words[at(SAMPLE, i)]), NONE, 0, W.FLY
-    w.shadow, w.single, w.left = 0, 0, 0
+    w.tries, w.shadow, w.single, w.left = 0, 0, 0, 0
     return w
 
 

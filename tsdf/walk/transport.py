@@ -45,7 +45,6 @@ from tsdf.walk.sides import HAIR
 from tsdf.walk.walker import (
     ASKED,
     CLEAR,
-    CLEARLY,
     DIM,
     ENDED,
     EVENTS,
@@ -62,6 +61,7 @@ from tsdf.walk.walker import (
     OTHER,
     PATIENCE,
     RAYS,
+    TRIES,
     TRUNCATED,
     UNENDING,
     UNKNOWN,
@@ -573,13 +573,20 @@ def escape(world, batch, w, amounts):
 
 
 @njit(**KERNEL)
-def again(batch, w, slack, cosine):
-    """Move the start of a walker's next ray beyond a facet that the ray engine sees and that is behind it."""
-    w.skip = max(2.0 * w.skip, slack)
-    if w.skip * abs(cosine) > CLEARLY * slack:
+def again(batch, w, way, n, slack):
+    """Take a walker's next ray from beyond a facet, of normal n, that the ray engine sees and that is behind it: from
+    farther along its way, and where it leaves along the facet from off it."""
+    w.tries += 1
+    if w.tries <= TRIES:
+        w.skip = max(2.0 * w.skip, slack)
+        return LOOK
+    cosine = dot(n, way)
+    if w.tries > 2 * TRIES or 4.0 * abs(cosine) > 1.0:
         batch.counters[FAULTS] += 1
         w.weight = 0.0
         return ENDED
+    write(w.p, step(triple(w.p), math.copysign(slack, cosine), n))
+    w.skip = slack
     return LOOK
 
 
@@ -590,12 +597,12 @@ def land(world, batch, w, amounts):
     p, e, m = triple(w.p), triple(w.e), w.medium
     t, surface, n, slack, spurious = surface_met(g, p, e, hits, w.ray)
     if spurious:
-        return again(batch, w, slack, dot(n, e))
+        return again(batch, w, e, n, slack)
     known = w.ray == hits.shape[0] - 1
     t_b, inside, n_b, slack_b, spurious = boundary_met(g, m, p, e, hits, w.ray, known)
     if spurious:
-        return again(batch, w, slack_b, dot(n_b, e))
-    w.skip = 0.0
+        return again(batch, w, e, n_b, slack_b)
+    w.skip, w.tries = 0.0, 0
     if not inside:  # by rounding: the jump begins on the boundary
         t_b = 0.0
     leaves = t_b < w.length
@@ -646,13 +653,13 @@ def fly(world, batch, w, amounts):
     p, d = triple(w.p), triple(w.d)
     t, surface, n, slack, spurious = surface_met(g, p, d, hits, w.ray)
     if spurious:
-        return again(batch, w, slack, dot(n, d))
+        return again(batch, w, d, n, slack)
     home, t_b, n_b, slack_b = NONE, math.inf, n, 0.0
     for m in range(g.kind.shape[0]):
         known = m == w.medium and w.ray == hits.shape[0] - 1
         t_m, inside, n_m, slack_m, spurious = boundary_met(g, m, p, d, hits, w.ray, known)
         if spurious:
-            return again(batch, w, slack_m, dot(n_m, d))
+            return again(batch, w, d, n_m, slack_m)
         if home == NONE and (inside or t_m < t_b):
             unsure = inside and w.medium == UNKNOWN and g.kind[m] == MESH
             if unsure and slipped(g.grid, hits[hits.shape[0] - 1], m, p, GRAZING * slack_m):
@@ -662,7 +669,7 @@ def fly(world, batch, w, amounts):
                 home = m
     if home != w.medium:
         w.free, w.left = -1.0, 0
-    w.skip, w.medium = 0.0, home
+    w.skip, w.tries, w.medium = 0.0, 0, home
     facing = abs(dot(n, d)) if t < math.inf else 1.0
     if home != NONE:
         state = pass_through(world, batch, w, amounts, t_b - HAIR * beyond(slack_b, dot(n_b, d)), t, slack / facing)
@@ -982,7 +989,7 @@ def spawn(batch, live, job, first, count):
             w.colour[k] = 1.0
         w.weight, w.luck, w.pdf, w.free, w.skip = 1.0, 0.0, -1.0, -1.0, 0.0
         w.key, w.events, w.sample, w.ray, w.medium, w.mode = key + GOLDEN, 0, local, NONE, UNKNOWN, FLY
-        w.shadow, w.single, w.left = 0, 0, 0
+        w.tries, w.shadow, w.single, w.left = 0, 0, 0, 0
         if job.met.shape[0] > 0:
             w.single = job.met[pixel]
         for k in range(batch.amounts.shape[1]):

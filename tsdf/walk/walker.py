@@ -20,7 +20,7 @@ WALKER = np.dtype(
      ("luck", "f8"), ("pdf", "f8"), ("free", "f8"), ("length", "f8"), ("gained", "f8"), ("skip", "f8"), ("b", "f8"),
      ("key", "u8"), ("grain", "u8"),
      ("events", "i8"), ("sample", "i4"), ("ray", "i4"), ("medium", "i4"), ("mode", "i4"), ("component", "i4"),
-     ("facet", "i4"), ("state", "i4"), ("shadow", "i4"), ("single", "i4"), ("left", "i4")]
+     ("facet", "i4"), ("state", "i4"), ("tries", "i4"), ("shadow", "i4"), ("single", "i4"), ("left", "i4")]
 )  # fmt: skip
 # p, d: place and direction. q, e, length, gained: of a jump, the direction after it, its own, its length and what it
 # adds to the amounts; in a grain, q is its centre, e where the ray starts. luck: logarithm of a bound of the
@@ -44,7 +44,7 @@ MAX_EVENTS = 50_000_000  # of one path; only light that nothing lets out comes t
 DIM = math.log(0.25)  # walkers dimmer than this may end
 FAINT = 0.02  # shadows fainter than this may end
 UNENDING = 1e300  # free path where nothing deflects or no grain is, finite so that 0 of it is 0
-CLEARLY = 128.0  # times its thickness off a facet that the ray engine sees there still: the mesh is at fault
+TRIES = 8  # to start a ray off a facet, each twice as far from it; and as many off the facet
 
 
 class Media(NamedTuple):
@@ -219,7 +219,7 @@ def cast(w, shadow, p, toward, light, weight, m, key):
     shadow.weight, shadow.luck, shadow.pdf, shadow.free = 1.0, 0.0, -1.0, -1.0
     shadow.skip, shadow.key, shadow.events = 0.0, key, 0
     shadow.sample, shadow.ray, shadow.medium, shadow.mode = w.sample, NONE, m, FLY
-    shadow.shadow, shadow.single, shadow.left = 1, w.single, 0
+    shadow.tries, shadow.shadow, shadow.single, shadow.left = 0, 1, w.single, 0
 
 
 @njit(**KERNEL)
