@@ -31,6 +31,12 @@ def field(n, jitter=0.0, steep=1.0):
     return np.concatenate([top, top * [1, 1, 0] - [0, 0, 3]]), np.concatenate([sides, sides[:, ::-1] + below, walls])
 
 
+def ball(floor=-1.0):
+    """A ball, or what of it is above a floor: a heap with steep flanks."""
+    points, faces = (np.asarray(part) for part in icosphere(subdivisions=4))
+    return points, faces[(points[faces, 2] >= floor).all(axis=1)]
+
+
 def lathe(levels):
     """A turned body: rings of 48 corners at given heights, closed by a corner at each end."""
     turn = 2.0 * np.pi * np.arange(48) / 48
@@ -112,9 +118,12 @@ def test_rings_of_a_lathe_are_meant(digits):
         (field(128), 0.01, "z"),  # a height map of 8 bits
         (field(41, jitter=0.3), 0.05, "z"),  # heights of single points
         (field(41, jitter=0.3), 0.05, "xyz"),
-        (icosphere(subdivisions=4), 0.01, "xyz"),
-        (icosphere(subdivisions=4), 0.03, "xyz"),
-        (icosphere(subdivisions=4), 0.03, "y"),
+        (ball(), 0.01, "xyz"),
+        (ball(), 0.03, "xyz"),
+        (ball(), 0.03, "y"),
+        (ball(), 0.005, "xy"),  # two axes of a body are no places
+        (ball(), 0.03, "yz"),
+        (ball(floor=0.0), 0.03, "xy"),
     ],
 )
 def test_tilt_is_that_of_the_facets(mesh, step, axes):
@@ -125,6 +134,27 @@ def test_tilt_is_that_of_the_facets(mesh, step, axes):
     assert tilt.angle > MOST_TILT and tilt.step == pytest.approx(step) and set(tilt.axes) <= set(axes)
     assert 0.8 * true < tilt.angle < 1.25 * true
     assert tilt_of(points, faces).angle < 1e-6
+
+
+@pytest.mark.parametrize("fine", "xyz")
+@pytest.mark.parametrize("step, finer", [(0.05, 0.005), (0.01, 0.0001)])
+def test_a_body_is_no_field(step, finer, fine):
+    """Digits of one axis finer than those of two: the two are told."""
+    points, faces = ball()
+    coarse = "xyz".replace(fine, "")
+    rounded = on_grid(on_grid(points, step, coarse), finer, fine)
+    tilt, true = tilt_of(rounded, faces), angle_between(points, rounded, faces)
+    assert tilt.axes == coarse and tilt.step == pytest.approx(step)
+    assert 0.75 * true < tilt.angle < 1.25 * true
+
+
+def test_places_of_a_sheet_are_meant():
+    """A field with a relief below too, walls between the two."""
+    points, faces = field(41)
+    half = len(points) // 2
+    points[half:, 2] = points[:half, 2] - 2.0 - 0.1 * np.sin(points[:half, 0])
+    assert tilt_of(np.round(points, 4), faces).angle < MOST_TILT
+    assert tilt_of(np.round(on_grid(points, 0.1, "z"), 4), faces).axes == "z"
 
 
 def test_a_grid_stretched_afterwards_is_told():

@@ -17,6 +17,7 @@ MOST_ROUNDING = 2e-6  # [R] coordinates rounded more coarsely than this cannot b
 FEWEST_LEVELS = 8  # of coordinates along an axis that tell a grid from a few chosen values
 FEWEST_CORNERS = 64  # of a mesh whose coordinates are rounded rather than chosen
 HEIGHTS = 0.25  # of the steps of two axes, below which the third's shows that these two are a lattice of places
+LEVEL = 1e-9  # tilt against an axis below which a facet is a wall or a floor
 ALONG_LEVELS = 0.9  # share of the facets with one side along a level, from which on levels are lines of the mesh
 TELLING = 0.2  # of the tilt by the worst axis, from which on an axis is named beside it
 
@@ -143,7 +144,7 @@ def grid_tilt(points: Floats, faces: Ints, steps: Steps) -> Tilt:
                 return Tilt(0.0, 0.0, "")
     normal = area_normals(points, faces)
     double = np.linalg.norm(normal, axis=1)
-    step[~_rounded(points, faces, step)] = steps.digits
+    step[~_rounded(points, faces, normal, step)] = steps.digits
     sides = np.linalg.norm(points[faces] - points[np.roll(faces, -1, axis=1)], axis=2)
     by_axis = (np.sqrt((sides**2).sum(axis=1)) / double**2)[:, None] * np.abs(normal) * step / np.sqrt(12)
     by_axis[np.abs(normal).max(axis=1) > (1 - 1e-9) * double] = 0.0
@@ -154,15 +155,22 @@ def grid_tilt(points: Floats, faces: Ints, steps: Steps) -> Tilt:
     return Tilt(float(np.average(tilt, weights=double)), float(step[telling].max(initial=0.0)), names)
 
 
-def _rounded(points: Floats, faces: Ints, step: Floats) -> NDArray[np.bool_]:
+def _rounded(points: Floats, faces: Ints, normal: Floats, step: Floats) -> NDArray[np.bool_]:
     """Return (3,) bool, along which axes coordinates stand on a grid for want of digits and not by design.
 
-    Two axes are a design where the third's grid is much finer: the digits that do for heights would do for places. So
-    is one whose levels are lines of the mesh, as the rings of a lathe and the rows of a field: then each facet, but for
-    those within the first and the last level, has just one side along a level, where rounding makes none or all three.
+    Two axes are a design where the third's grid is much finer, the digits that do for heights would do for places, and
+    the mesh is a height field: slopes that face up meet none that face down, but walls or a level floor. So is one
+    whose levels are lines of the mesh, as the rings of a lathe and the rows of a field: then each facet, but for those
+    within the first and the last level, has just one side along a level, where rounding makes none or all three.
     """
-    finest, middle, _ = np.sort(step)
-    rounded = step <= finest if finest < HEIGHTS * middle else np.ones(3, bool)
+    up, middle, _ = np.argsort(step)
+    rounded = np.ones(3, bool)
+    if step[up] < HEIGHTS * step[middle]:
+        height, across = normal[:, up], np.abs(np.delete(normal, up, axis=1)).max(axis=1)
+        slope = np.minimum(np.abs(height), across) > LEVEL * np.maximum(np.abs(height), across)
+        rising, hanging = faces[slope & (height > 0)], faces[slope & (height < 0)]
+        if not np.isin(rising, hanging).any():
+            rounded = np.arange(3) == up
     for axis in np.flatnonzero(rounded & (step > 0)):
         level = np.rint((points[:, axis] - points[:, axis].min()) / step[axis])[faces]
         inner = (level > 0).any(axis=1) & (level < level.max()).any(axis=1)
