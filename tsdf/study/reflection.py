@@ -11,7 +11,7 @@ import numpy as np
 
 NODES = 8  # in a cell
 BATCH = 64  # wavelengths at once, for memory
-FELT = 1e-4  # k over n below which a surface does not know of it: 1e-8 of the light
+FELT = 3e-3  # k over n below which a surface does not know of it: 1e-5 of the light
 LEAST = 1e-6  # of the light, that is told from none
 TINY = 1e-12
 

@@ -21,7 +21,7 @@ FEEBLE = 1e-12  # co-albedo of what does not absorb, so that nothing is 0 / 0
 DEEPEST = 300.0  # exponents beyond are all the same
 DIRECTIONS = 24  # of doubling, in each half of the sphere
 ORDERS = 2 * DIRECTIONS  # of Legendre moments that it takes
-THINNEST, THICKEST = 1e-5, 1e8  # optical depth of the layer that it begins with, and of a half-space
+THINNEST, THICKEST = 1e-4, 1e8  # optical depth of the layer that it begins with, and of a half-space
 
 
 class Streams(NamedTuple):
