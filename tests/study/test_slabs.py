@@ -276,6 +276,20 @@ def test_doubling_of_thick_slabs() -> None:
         assert passed == pytest.approx(4.0 / 3.0 / ((1.0 - one) * tau + 1.42), rel=0.01, abs=5e-7)
 
 
+def test_light_that_white_ground_sends_up_again(family: Family, found: Spectrum) -> None:
+    """What reaches the ground again and again is more than came in, and layers have what is left of it; a lossless slab
+    on white ground sends all of it back, however thick it is."""
+    request = Request("volume", FRACTION, 4.0, 1.0, ground=0.9, depths=2)
+    got = slabs.measure(family, found, request, paths=8192, threads=2)
+    assert got.transmittance[1] > 1.0 + 5.0 * got.transmittance_error[1]
+    off = np.abs(got.transmittance - got.theories.doubled.transmittance)
+    assert (off < SIGMAS * got.transmittance_error + 2.0 * got.theories.between + 0.002).all(), off
+    assert got.reflectance + 0.1 * got.transmittance + got.profile.sum(axis=0) == pytest.approx(np.ones(8), abs=1e-6)
+    moments = np.tile(0.85 ** np.arange(streams.ORDERS + 1.0), (3, 1))
+    light = streams.doubled(np.array([1e3, 1e5, 1e7]), np.ones(3), moments, None)
+    assert streams.over_ground(light, light, 1.0).reflectance == pytest.approx(np.ones(3), abs=1e-6)
+
+
 # ------------------------------------------------------------------------------------------------ bad input
 
 

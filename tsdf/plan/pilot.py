@@ -114,6 +114,7 @@ class Pilot:
         self.portions: dict[int, list[float]] = {}  # [s] of one thread, by how many samples of each pixel they were
         self.marks: list[Mark] = []
         self.like: Pilot | None = None  # whose times say how those of many samples are to those of few
+        self._kept: tuple[object, Seen] | None = None  # asked for thousands of times a plan
         self._walkers: list[Walkers] = []
 
     @property
@@ -206,6 +207,16 @@ class Pilot:
     @property
     def seen(self) -> Seen:
         """What it saw so far."""
+        of = self.like.portions if self.like is not None else {}
+        state = (
+            float(self.sums.sum()), int(self.counts.sum()), len(self.pixels),
+            *(len(spent) for times in (self.portions, of) for spent in times.values()),
+        )  # fmt: skip
+        if self._kept is None or self._kept[0] != state:
+            self._kept = state, self._seen()
+        return self._kept[1]
+
+    def _seen(self) -> Seen:
         seen = self.looked
         count, samples = HALVES * self.counts[seen][:, None], HALVES * int(self.counts.sum())
         each, met = self.sample_seconds, self.events / max(samples, 1)

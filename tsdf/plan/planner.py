@@ -191,7 +191,7 @@ class _Planning(Evidence):
         thin = all(medium.packing_fraction <= MOST_PACKED for medium in self.scene.media)
         lacking = needs.of_tables(self.named, self.target, chosen.candidate.level, thin)
         beyond = self.spp is None and math.isfinite(self.limit) and not (
-            chosen.seconds(self.target) <= self.limit / self.load
+            chosen.done(self.target) <= self.limit / self.load
         )  # fmt: skip
         made = Plan(
             self.asked, self.target, self.limit if self.said or beyond else None, (chosen, *rest), far, (),

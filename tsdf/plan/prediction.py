@@ -216,10 +216,12 @@ class Plan:
     @property
     def noise(self) -> float:
         """Standard error of pixels at which the whole error is the target, and no more than a fifth above it if it has
-        as much beside noise as may well be; half of the target where that is out of reach."""
+        as much beside noise as may well be, where that is in reach; half of the target where neither is."""
         floor, target = self.chosen.floor, self.target
         likely, safe = target**2 - floor.value**2, (SLACK * target) ** 2 - floor.high**2
-        return math.sqrt(min(likely, safe) if min(likely, safe) > 0.0 else max(likely, 0.25 * target**2))
+        if likely > 0.0:
+            return math.sqrt(min(likely, safe) if safe > 0.0 else likely)
+        return 0.5 * target
 
     @property
     def planned(self) -> Scene:

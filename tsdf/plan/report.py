@@ -104,7 +104,7 @@ def _first(plan: Plan) -> str:
         after, met = f"an error of {percent(p.floor.value)} at best", f"none is sure to meet {percent(plan.target)}"
     else:
         after = f"an error of {percent(plan.target)} after {_about(plan, takes)}"
-        met = f"noise {percent(math.sqrt(max(plan.target**2 - p.floor.value**2, 0.0)))}"
+        met = f"noise {percent(plan.noise)}"
     if (blocks := _of_blocks(plan)) is not None:
         met += f"; means of {BLOCK} by {BLOCK} pixels are off by {blocks}"
     if (most := _at_most(plan)) is not None:
@@ -144,7 +144,7 @@ def wider_sun(plan: Plan) -> str | None:
         return None
     ways = []
     for p in plan.predictions:
-        if p.candidate.single and p.piloted and math.isfinite(p.variance):
+        if p.candidate.single and p.piloted and 0.0 < p.variance < math.inf:
             noise = p.variance / plan.rarer * p.turn / plan.able  # squared, under the suns of pilots
             more = min(max((plan.target**2 - p.floor.value**2) / noise, 1.0), plan.rarer)  # as it may be
             error = max(math.hypot(p.floor.value, math.sqrt(more * noise)), plan.target)
@@ -211,7 +211,7 @@ def _reason(plan: Plan, bodies: Sequence[Body], footprint: float, coverage: floa
 def _other(plan: Plan) -> str:
     if len(plan.predictions) < 2:
         return "no other candidate is possible"
-    if plan.able is not None and plan.spp is None and not plan.chosen.seconds(plan.target) <= plan.able:
+    if plan.able is not None and plan.spp is None and not plan.chosen.done(plan.target) <= plan.able:
         return _short_of_time(plan, plan.able)
     chosen = plan.chosen
     second = min(plan.predictions[1:], key=lambda p: (p.sure_seconds(plan.target), p.floor.value))

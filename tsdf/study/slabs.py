@@ -452,9 +452,8 @@ def measure(
         if request.ground > 0.0 and math.isfinite(request.thickness):
             whole = streams.over_ground(light, diffuse, request.ground)
             profile = layers[0] + request.ground * whole.transmittance * layers[-1][::-1]
-        whole = streams.Streams(
-            *(np.clip(of + more, 0.0, 1.0) for of, more in zip(whole, theories.surface, strict=True))
-        )
+        reflected, passed = (of + more for of, more in zip(whole, theories.surface, strict=True))
+        whole = streams.Streams(np.clip(reflected, 0.0, 1.0), np.maximum(passed, 0.0))  # what passes, again and again
         if len(profile) and math.isfinite(request.thickness):
             # where free paths depend on absorption, layers do not know
             kept = whole.reflectance + (1.0 - request.ground) * whole.transmittance

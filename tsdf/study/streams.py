@@ -155,8 +155,9 @@ def over_ground(light: Streams, diffuse: Streams, ground: np.ndarray | float) ->
 
     The slab is the same from below as from above: `diffuse` is what it does to the ground's light.
     """
-    back = ground / (1.0 - ground * diffuse.reflectance)
+    lost = 1.0 - ground + ground * diffuse.transmittance  # at least, each time
+    back = ground / np.maximum(np.maximum(1.0 - ground * diffuse.reflectance, lost), 1e-300)
     return Streams(
-        light.reflectance + light.transmittance * back * diffuse.transmittance,
+        np.clip(light.reflectance + light.transmittance * back * diffuse.transmittance, 0.0, 1.0),
         light.transmittance * (1.0 + back * diffuse.reflectance),
     )
