@@ -108,12 +108,14 @@ def test_levels_are_those_of_the_renderer(family: Family, found: Spectrum, level
 @pytest.mark.slow
 @pytest.mark.parametrize("level", ["volume", "teleport", "teleport-memory"])
 def test_layers_add_up(family: Family, found: Spectrum, level: str) -> None:
-    """What comes back, what the ground keeps and what layers absorb is all the light, before it is made to be: sums of
-    the raw layers, at a level whose free paths know nothing of absorption, are within the cells of path length."""
+    """What comes back, what the ground keeps and what layers absorb is all the light, where it is made to be and where so
+    little is absorbed that it is not; so are sums of the raw layers, at a level whose free paths know nothing of
+    absorption, within the cells of path length."""
     request = Request(level, FRACTION, 10.0, 0.7, ground=0.4, depths=5)
     got = slabs.measure(family, found, request, threads=2, paths=4096)
     whole = got.reflectance + 0.6 * got.transmittance + got.profile.sum(axis=0)
-    assert whole == pytest.approx(np.ones(len(whole)), abs=1e-9)
+    error = SIGMAS * np.hypot(got.reflectance_error, got.transmittance_error) + 1e-9
+    assert (np.abs(whole - 1.0) < np.where(found.albedo < slabs.FAINTLY, 1e-9, error)).all()
     sets = slabs.Paths.start(family.tables[2], replace(request, ground=0.0), 0.7, found.absorption_times_radius, 0)
     sets.stretch[:] = 0.0
     from concurrent.futures import ThreadPoolExecutor
@@ -284,7 +286,10 @@ def test_light_that_white_ground_sends_up_again(family: Family, found: Spectrum)
     assert got.transmittance[1] > 1.0 + 5.0 * got.transmittance_error[1]
     off = np.abs(got.transmittance - got.theories.doubled.transmittance)
     assert (off < SIGMAS * got.transmittance_error + 2.0 * got.theories.between + 0.002).all(), off
-    assert got.reflectance + 0.1 * got.transmittance + got.profile.sum(axis=0) == pytest.approx(np.ones(8), abs=1e-6)
+    error = np.hypot(got.reflectance_error, 0.1 * got.transmittance_error)
+    left = got.reflectance + 0.1 * got.transmittance + got.profile.sum(axis=0) - 1.0
+    assert (np.abs(left) < np.where(found.albedo < slabs.FAINTLY, 1e-6, SIGMAS * error)).all()
+    assert (got.profile > 0.0).all()
     moments = np.tile(0.85 ** np.arange(streams.ORDERS + 1.0), (3, 1))
     light = streams.doubled(np.array([1e3, 1e5, 1e7]), np.ones(3), moments, None)
     assert streams.over_ground(light, light, 1.0).reflectance == pytest.approx(np.ones(3), abs=1e-6)

@@ -43,6 +43,7 @@ CLEAR = 5.0  # [R] above the slab where light starts
 BINS = 256  # of the logarithm of the matter crossed
 LENGTHS = np.concatenate(([0.0], np.geomspace(1e-4, 1e12, BINS)))  # [R], or grains met
 LATTICE = (0.7548776662466927, 0.5698402909980532)  # inverse powers of the root of a^3 = a + 1
+FAINTLY = 0.999  # albedo from which on free paths are those without absorption to a thousandth
 FAINT = 1e-6  # [1/R] an absorption coefficient for which free paths are taken
 CROSSINGS = 2  # that a path counts among the grains met: its way into the slab and out
 LONG = 512  # grains met between two times that a path may be given up
@@ -455,9 +456,10 @@ def measure(
         reflected, passed = (of + more for of, more in zip(whole, theories.surface, strict=True))
         whole = streams.Streams(np.clip(reflected, 0.0, 1.0), np.maximum(passed, 0.0))  # what passes, again and again
         if len(profile) and math.isfinite(request.thickness):
-            # where free paths depend on absorption, layers do not know
+            # where free paths depend on absorption, layers do not know; of faint ones the rest is noise
             kept = whole.reflectance + (1.0 - request.ground) * whole.transmittance
-            profile = profile * ((1.0 - kept) / np.maximum(profile.sum(axis=0), 1e-300))
+            rest = (1.0 - kept) / np.maximum(profile.sum(axis=0), 1e-300)
+            profile = profile * np.where(found.albedo < FAINTLY, rest, 1.0)
         elif len(profile):
             profile = profile * ((1.0 - whole.reflectance) / np.maximum(1.0 - light.reflectance, 1e-300))
         return np.array(whole), profile
