@@ -108,8 +108,8 @@ def test_levels_are_those_of_the_renderer(family: Family, found: Spectrum, level
 @pytest.mark.slow
 @pytest.mark.parametrize("level", ["volume", "teleport", "teleport-memory"])
 def test_layers_add_up(family: Family, found: Spectrum, level: str) -> None:
-    """What comes back, what the ground keeps and what layers absorb is all the light, where it is made to be and where so
-    little is absorbed that it is not; so are sums of the raw layers, at a level whose free paths know nothing of
+    """What comes back, what the ground keeps and what layers absorb is all the light, where it is made to be and where
+    so little is absorbed that it is not; so are sums of the raw layers, at a level whose free paths know nothing of
     absorption, within the cells of path length."""
     request = Request(level, FRACTION, 10.0, 0.7, ground=0.4, depths=5)
     got = slabs.measure(family, found, request, threads=2, paths=4096)
