@@ -492,8 +492,9 @@ def measure(
     whole, profile = result()
     profile_error = _jackknife([result(group)[1] for group in range(GROUPS)]) if request.depths else profile
     if (felt := found.surface.felt).any():
-        unsure = found.surface.unsure(family.weights(n[felt]), np.einsum(
-            "wt,tw->w", family.weights(n[felt]), found.albedo_of_tables[:, felt]))  # fmt: skip
+        full = family.weights(n[felt])
+        alone = np.einsum("wt,tw->w", full, found.albedo_of_tables[:, felt])
+        unsure = found.surface.unsure(full, alone)
         error[:, felt] += unsure * np.abs(theories.surface)[:, felt]
     return Albedo(
         whole[0], whole[1], error[0], error[1], theories, profile, profile_error, flat[0].edges, done, eta,

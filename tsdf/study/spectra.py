@@ -195,16 +195,15 @@ class Family:
         x = np.nan_to_num(found.absorption_times_radius)
         whole, last = np.zeros((len(x), len(edges) - 1)), len(self.tables) - 1
         place = np.interp(found.constants.n, self.eta, np.arange(last + 1.0))
-        for i, table in enumerate(self.tables):
-            share = np.maximum(0.0, 1.0 - np.abs(place - i))
-            share = np.where(found.surface.felt, share * found.albedo_of_tables[i], share)
+        shares = np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(last + 1.0)))
+        for table, share in zip(self.tables, found.weighed(shares).T, strict=True):
             for w in np.flatnonzero(share):
                 whole[w] += share[w] * table.deflection_masses(float(x[w]))
         felt = found.surface.felt
         if felt.any():
-            shares = np.maximum(0.0, 1.0 - np.abs(place[felt, None] - np.arange(last + 1.0)))
-            energy = found.surface.energy(shares, whole[felt].sum(axis=1), whole[felt], found.surface.sent(edges))
-            whole[felt] = np.nan_to_num(_over(np.maximum(energy, 0.0), np.maximum(energy, 0.0).sum(axis=1)))
+            sent = found.surface.sent(edges)
+            energy = np.maximum(found.surface.energy(shares[felt], whole[felt].sum(axis=1), whole[felt], sent), 0.0)
+            whole[felt] = np.nan_to_num(_over(energy, energy.sum(axis=1)))
         return edges, whole
 
 
@@ -254,6 +253,10 @@ class Spectrum:
             w, g = self.albedo, np.where(self.albedo > 0.0, self.g, 0.0)
             return np.hypot(w * self.error("g"), (g - self.g_far) * self.error("albedo")) / (1.0 + w)
         return self.noise[name] + self.between[name]
+
+    def weighed(self, weights: np.ndarray) -> np.ndarray:
+        """Return weights of tables (w, t) for means over what leaves: of energies, where k is felt at the surface."""
+        return np.where(self.surface.felt[:, None], weights * self.albedo_of_tables.T, weights)
 
 
 def _over(energy: np.ndarray, whole: np.ndarray) -> np.ndarray:
@@ -348,23 +351,25 @@ def spectrum(family: Family, constants: Constants, radius: float) -> Spectrum:
     if (felt := surface.felt).any():
         each = values[:, 0] * np.stack([np.ones_like(values[:, 0]), np.nan_to_num(values[:, 1])])  # (2, t, w)
 
-        def put(weights: np.ndarray) -> np.ndarray:
-            of_n = np.einsum("wt,qtw->wq", weights, each[:, :, felt])
-            energy = surface.energy(weights, of_n[:, 0], of_n, surface.whole)
-            return np.stack([np.clip(energy[:, 0], 0.0, 1.0), _over(energy[:, 1], energy[:, 0])])
+        def put(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            """Return albedo and g with k, and the share of what k changes that may be wrong."""
+            alone = np.einsum("wt,qtw->wq", weights, each[:, :, felt])
+            energy = surface.energy(weights, alone[:, 0], alone, surface.whole)
+            both = np.stack([np.clip(energy[:, 0], 0.0, 1.0), _over(energy[:, 1], energy[:, 0])])
+            return both, surface.unsure(weights, alone[:, 0])
 
-        of_n, with_k = np.nan_to_num(found[:2, felt]), put(weights[felt])
-        energy = np.einsum("wt,tw->w", weights[felt], each[0][:, felt])
-        far = surface.unsure(weights[felt], energy) * np.abs(with_k - of_n)
+        with_k, unsure = put(weights[felt])
+        change = np.abs(with_k - np.nan_to_num(found[:2, felt]))
+        far = unsure * change
         found[:2, felt] = with_k
-        missed[:2, felt] = far + (np.abs(put(coarser[felt]) - with_k) if coarser is not None else 0.0)
-        notable = np.abs(with_k[0] - of_n[0]) > NOTABLE
+        missed[:2, felt] = far + (np.abs(put(coarser[felt])[0] - with_k) if coarser is not None else 0.0)
+        notable = change[0] > NOTABLE
         if notable.any():
             there = constants.wavelength_nm[felt][notable]
             where = f"at {there[0]:g}" if len(there) == 1 else f"between {there.min():g} and {there.max():g}"
             notes.append(
                 f"{where} nm k changes what the surface sends back, the albedo by up to "
-                f"{np.abs(with_k[0] - of_n[0]).max():.2g}: put in as of convex grains; what that may miss, up to "
+                f"{change[0].max():.2g}: put in as of convex grains; what that may miss, up to "
                 f"{far[0].max():.1g} of the albedo and {far[1].max():.1g} of g, is in the errors"
             )
     if unknown.any():
@@ -399,21 +404,20 @@ def moments_of(family: Family, found: Spectrum, orders: int) -> tuple[np.ndarray
     """Return Legendre moments by wavelength, (w, orders + 1) float64, and the share that goes straight on, (w,)."""
     x = np.where(np.isnan(found.absorption_times_radius), 0.0, found.absorption_times_radius)
     weights = family.weights(found.constants.n)
-    weights = np.where(found.surface.felt[:, None], weights * found.albedo_of_tables.T, weights)
     whole, straight = np.zeros((len(x), orders + 1)), np.zeros(len(x))
-    for i, table in enumerate(family.tables):
+    for table, share in zip(family.tables, found.weighed(weights).T, strict=True):
         masses = np.array([table.deflection_masses(float(a)) for a in x])
-        whole += weights[:, i, None] * legendre(table.cos_theta_edges, masses, orders)
-        straight += weights[:, i] * masses[:, -1]
+        whole += share[:, None] * legendre(table.cos_theta_edges, masses, orders)
+        straight += share * masses[:, -1]
     felt = found.surface.felt
     if felt.any():
         edges = np.linspace(-1.0, 1.0, 4 * orders + 65)
         tables, here = (legendre(edges, masses, orders) for masses in found.surface.sent(edges))
-        shares = family.weights(found.constants.n[felt])
-        albedo = whole[felt, 0]
-        energy = found.surface.energy(shares, albedo, whole[felt], (tables, here))
+        weights, albedo = weights[felt], whole[felt, 0]
+        energy = found.surface.energy(weights, albedo, whole[felt], (tables, here))
         none = np.zeros(len(family.tables)), np.zeros(int(felt.sum()))
-        straight[felt] = np.nan_to_num(_over(found.surface.energy(shares, albedo, straight[felt], none), energy[:, 0]))
+        ahead = found.surface.energy(weights, albedo, straight[felt], none)
+        straight[felt] = np.nan_to_num(_over(ahead, energy[:, 0]))
         whole[felt] = np.nan_to_num(_over(energy, energy[:, 0]))
     return whole, np.clip(straight, 0.0, 1.0)
 
